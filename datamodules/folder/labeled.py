@@ -45,6 +45,7 @@ class LabeledFolder(ImageDataModule):
         split_seed: Seed of both splits. Independent of the run's seed, so that runs with
             different seeds share their splits.
         depth_units_per_m: Units per meter of integer depth files, 1000 for millimeters.
+        depth_channel: Channel of OpenEXR depth files, see `read_depth_m`.
 
     Raises:
         DataError: ``classes.json`` is missing or cannot be used.
@@ -54,6 +55,7 @@ class LabeledFolder(ImageDataModule):
     test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
     split_seed: NonNegativeInt = 0
     depth_units_per_m: PositiveFloat = 1000
+    depth_channel: str | None = None
 
     def find_label_map(self) -> LabelMap:
         """Return the classes of ``classes.json``: the network needs their number early."""
@@ -111,11 +113,12 @@ class LabeledFolder(ImageDataModule):
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`."""
         path: Any = files.depth
-        return meters_to_steps(read_depth_m(path, self.depth_units_per_m))
+        return meters_to_steps(read_depth_m(path, self.depth_units_per_m, self.depth_channel))
 
     def decode_settings(self) -> dict[str, Any]:
         """See `DataModule`."""
-        return {**super().decode_settings(), "units": self.depth_units_per_m}
+        depth = {"units": self.depth_units_per_m, "channel": self.depth_channel}
+        return {**super().decode_settings(), **depth}
 
 
 @data_set

@@ -58,12 +58,12 @@ def predict(settings: PredictSettings) -> None:
     print_text(f"{counted(len(missing) + done, 'images')}, {done} done already.")
     if missing:
         prediction.count(inputs)
-    errors: dict[str, dict[str, str]] = {}
+    errors: dict[str, dict[str, Any]] = {}
     steps = prediction.predict, prediction.read, prediction.write
     with closing(work_on("Predicting", inputs.jobs(missing), len(missing), *steps)) as jobs:
         for job in jobs:
             if job.error:
-                errors[job.name] = {"file": str(job.path), "error": job.error}
+                errors[job.name] = {"file": str(job.path), **job.place, "error": job.error}
             else:
                 manifest.finish(job.name, file=str(job.path), **job.value)
     manifest = Manifest.open(settings.output, same)  # with what other shards have finished
@@ -93,7 +93,7 @@ def predict(settings: PredictSettings) -> None:
 
 def _write_videos(
     inputs: Inputs, folder: PredictionFolder, manifest: Manifest
-) -> dict[str, dict[str, str]]:
+) -> dict[str, dict[str, Any]]:
     """Write the result videos of videos whose frames are all finished; return errors by name."""
     whole = {n: v for n, v in inputs.videos.items() if not manifest.missing(v.frames)}
     jobs = [Job(name, video.path) for name, video in whole.items()]
@@ -149,7 +149,8 @@ class _Prediction:
             if settings.depth is None:
                 expected = "a folder of depth images, which the network takes"
                 raise SettingError("depth", found="null", expected=expected)
-            self._depth = images.DepthFolder(settings.depth, settings.depth_scale)
+            of_file = settings.depth_scale, settings.depth_channel
+            self._depth = images.DepthFolder(settings.depth, *of_file)
 
     def count(self, inputs: Inputs) -> None:
         """Let the head count in some of the images, see `Head.count`."""
@@ -199,6 +200,7 @@ class _Prediction:
         entry: dict[str, Any] = {"rows": pixels.shape[0], "columns": pixels.shape[1]}
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
+        entry |= job.place
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
         return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
@@ -221,7 +223,9 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()
-    return names | ({"depth", "depth_scale"} if "depth" in loaded.inputs else set())
+    return names | (
+        {"depth", "depth_scale", "depth_channel"} if "depth" in loaded.inputs else set()
+    )
 
 
 if __name__ == "__main__":

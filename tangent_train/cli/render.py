@@ -86,7 +86,7 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     manifest = Manifest.open(output, content)
 
     def work(job: Job, progress: Callable[[float], object]) -> None:
-        image, area = read_placed(job.path, kind, settings.area, job.value)
+        image, area = read_placed(job.path, kind, settings.area, job.value, settings.depth_channel)
         shape = image.shape[0], image.shape[1]
         view = (grid, faces, level) if settings.colmap else _views(settings, shape[0])
         if settings.colmap:
@@ -141,7 +141,8 @@ def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
     """Write the figure of the first panorama."""
     check_new(path, overwrite=settings.overwrite)
     job = next(iter(inputs.jobs(inputs.names)))
-    image, _ = read_placed(job.path, settings.interpolation, settings.area, job.value)
+    kind, channel = settings.interpolation, settings.depth_channel
+    image, _ = read_placed(job.path, kind, settings.area, job.value, channel)
     grid = _views(settings, image.shape[0])[0]
     if not isinstance(grid, TangentGrid):
         raise SettingError("figure", found=path, expected=f"null, for views={settings.views}")
@@ -197,7 +198,8 @@ def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
 
     def write(folder: Path, cameras_file: Path, path: Path, *, adds_suffix: bool = False) -> None:
         cameras = read_cameras(cameras_file)
-        results = TangentResults.read(result_files(folder, cameras), cameras.grid, settings.kind)
+        of_files = settings.kind, settings.depth_channel
+        results = TangentResults.read(result_files(folder, cameras), cameras.grid, *of_files)
         rows = settings.height
         shape = cameras.shape if rows is None else (rows, 2 * rows)
         path = path.with_name(path.name + results.suffix) if adds_suffix else path
@@ -230,9 +232,9 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
     "input": (
         _render_views,
         {"every", "area", "views", "base_level", "level", "dim", "faces", "rotation", "format"}
-        | {"interpolation", "colmap", "mask", "mask_classes", "figure"},
+        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"},
     ),
-    "back": (_render_back, {"cameras", "blend", "height", "kind", "z_depth"}),
+    "back": (_render_back, {"cameras", "blend", "height", "kind", "depth_channel", "z_depth"}),
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""

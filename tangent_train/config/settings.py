@@ -107,6 +107,9 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """folder of depth images with the names of the inputs, for networks with depth"""
     depth_scale: PositiveFloat = 1000
     """units per meter in depth files of integers, read or written"""
+    depth_channel: str | None = None
+    """OpenEXR files: channel of depth, e.g. ViewLayer.Depth.Z; null = the one called Z, depth,
+    depth.Z or depth.V"""
     projection: Literal["equirectangular", "perspective"] = "equirectangular"
     """equirectangular | perspective (photos)"""
     fill: Literal["black", "mean", "edge", "reflect"] | None = None
@@ -188,6 +191,9 @@ class RenderSettings(ImageSettings):
     """png | jpg | webp | tif | npy"""
     interpolation: Literal["bilinear", "nearest"] = "bilinear"
     """bilinear | nearest (for labels and depth)"""
+    depth_channel: str | None = None
+    """OpenEXR files: channel to read, e.g. ViewLayer.Depth.Z; null = colors, or for nearest and
+    depth the one called Z, depth, depth.Z or depth.V"""
     colmap: bool = False
     """true: one project for COLMAP of all panoramas: images, masks and rig_config.json"""
     mask: float | ExistingPath | None = None

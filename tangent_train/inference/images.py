@@ -90,10 +90,12 @@ class DepthFolder:
     Attributes:
         path: Path of the folder.
         units_per_m: Units per meter in files with integers.
+        channel: Channel of depth in OpenEXR images, see `read_depth_m`.
     """
 
     path: Path
     units_per_m: float
+    channel: str | None = None
 
     @cached_property
     def _files(self) -> NamedFiles:
@@ -111,7 +113,7 @@ class DepthFolder:
         """
         remedy = "Put depth into a folder of its own, with the names of the images."
         path = find_depth(self._files, name, remedy)
-        depth_m = read_depth_m(path, self.units_per_m)
+        depth_m = read_depth_m(path, self.units_per_m, self.channel)
         height, width = depth_m.shape
         if abs(width * shape[0] / (height * shape[1]) - 1) > _ASPECT_TOLERANCE:
             raise DataError(

@@ -1,56 +1,137 @@
-"""Depth in OpenEXR images, by the OpenEXR package (the extra ``exr``)."""
+"""Depth and colors in OpenEXR images, by the OpenEXR package (the extra ``exr``)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import of_extra
+from tangent_train.errors import DataError, of_extra
 from tangent_train.files import atomic_path
+from tangent_train.io.image_files import MOST_PIXELS
+
+_MOST_NAMED = 100
+"""Largest number of channels that a message names."""
 
 
-def open_exr(path: Path) -> tuple[tuple[int, int], Callable[[bool], NDArray[Any]]]:
+def open_exr(
+    path: Path, channel: str | None = None
+) -> tuple[tuple[int, int], Callable[[bool], NDArray[Any]]]:
     """Read the header of an OpenEXR image.
 
+    Args:
+        path: The file. In a file of several parts, the name of a part is the layer of its channels.
+        channel: Name of the channel to decode; None for depth or colors.
+
     Returns:
-        Rows and columns; and a function that decodes one channel ``(H, W)`` as float32, float16 or
-        uint32. Of several channels, it is the one whose name ends in Z, Y, V or R, in this order of
-        preference.
+        Rows and columns of the display window; and a function that decodes its pixels, 0 outside
+        the data window: given True, the channel of depth, ``(H, W)`` as float32, float16 or uint32;
+        given False, the colors, ``(H, W, 3)`` as float32, or depth if there are no colors.
 
     Raises:
         SettingError: The OpenEXR package is missing.
     """
     with of_extra("exr", path, "Or convert the file to a float TIFF."):
         import OpenEXR
-    with OpenEXR.File(str(path), header_only=True) as header:
-        (left, top), (right, bottom) = (c.tolist() for c in header.header()["dataWindow"])
-    size = bottom - top + 1, right - left + 1
+    with OpenEXR.File(str(path), header_only=True) as file:
+        # Closing the file clears its own headers.
+        headers = [dict(part.header) for part in file.parts]
+    windows = [_window(header["dataWindow"]) for header in headers]
+    if max(np.prod(shape) for _, shape in windows) > MOST_PIXELS:
+        raise ValueError(f"a data window of more than {MOST_PIXELS} pixels")
+    corner, size = _window(headers[0]["displayWindow"])
+    places = {
+        _full_name(header.get("name", "") if headers[1:] else "", one.name): (part, one.name)
+        for part, header in enumerate(headers)
+        for one in header["channels"]
+    }
 
     def decode(indices: bool) -> NDArray[Any]:
-        del indices
+        names = _chosen_names(path, list(places), channel, indices=indices)
+        decoded = []
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = file.channels()
-            name = _depth_channel(list(channels))
-            pixels: NDArray[Any] = channels[name].pixels if name else np.empty(())
-            if len(file.parts) != 1 or pixels.shape != size or pixels.dtype == object:
-                raise ValueError(
-                    f"{len(file.parts)} parts, channels {', '.join(channels)}; one part and one "
-                    "depth per pixel, in a single channel or one called Z, Y, V or R"
-                )
-        return pixels
+            if len(file.parts) != len(headers):  # the package leaves broken parts out
+                raise ValueError("a broken part")
+            for part, name in (places[name] for name in names):
+                pixels: NDArray[Any] = file.parts[part].channels[name].pixels
+                first, shape = windows[part]
+                if pixels.dtype == object or pixels.shape != tuple(shape):
+                    raise ValueError(f"channel {name}: several samples per pixel, or subsampled")
+                decoded.append(_placed(pixels, first - corner, size))
+        return decoded[0] if len(decoded) == 1 else np.stack(decoded, -1).astype(np.float32)
 
-    return size, decode
+    return (int(size[0]), int(size[1])), decode
 
 
-def _depth_channel(names: list[str]) -> str:
-    """Return the name of the channel of depth, empty without one."""
-    # Renderers put the name of a layer first: "ViewLayer.Depth.Z".
-    of_letters = ([name for name in names if name.rsplit(".", 1)[-1] == end] for end in "ZYVR")
-    return next((found[0] for found in (names, *of_letters) if len(found) == 1), "")
+def _window(corners: Any) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the row and column of the first pixel, and the numbers of rows and columns."""
+    first, last = (np.asarray(corner, np.int64)[::-1] for corner in corners)
+    return first, last - first + 1
+
+
+def _placed(
+    pixels: NDArray[Any], offset: NDArray[np.int64], size: NDArray[np.int64]
+) -> NDArray[Any]:
+    """Place pixels at a row and column of an image of zeros; cut them to it."""
+    image = np.zeros(size, pixels.dtype)
+    (top, left), (bottom, right) = offset, np.maximum(offset + pixels.shape, 0)
+    inside = image[max(top, 0) : bottom, max(left, 0) : right]
+    inside[:] = pixels[max(-top, 0) :, max(-left, 0) :][: inside.shape[0], : inside.shape[1]]
+    return image
+
+
+def _full_name(part: str, channel: str) -> str:
+    has_name = not part or channel == part or channel.startswith(f"{part}.")
+    return channel if has_name else f"{part}.{channel}"
+
+
+def _chosen_names(
+    path: Path, names: Sequence[str], channel: str | None, *, indices: bool
+) -> list[str]:
+    """Return the name of the channel of depth, or the names of red, green and blue.
+
+    Raises:
+        DataError: There is not exactly one such channel or layer.
+    """
+    layers: dict[str, dict[str, str]] = {}
+    for name in names:
+        layer, _, last = name.rpartition(".")
+        layers.setdefault(layer, {})[last.upper()] = name
+    colors = [[of[c] for c in "RGB"] for of in layers.values() if of.keys() >= {*"RGB"}]
+    depth = [[name] for name in names if _is_depth(name, names)]
+    choices, expected = depth, "one channel of depth: Z, depth, depth.Z or depth.V in any layer"
+    if channel is not None:
+        choices, expected = [[name] for name in names if name == channel], f"channel {channel}"
+    elif colors and not indices:
+        choices, expected = colors, "one layer with the channels R, G and B"
+    if len(choices) != 1:
+        listed = ", ".join(names[:_MOST_NAMED]) + "…" * (len(names) > _MOST_NAMED)
+        raise DataError(
+            path,
+            found="; ".join(", ".join(one) for one in choices) or "none",
+            expected=expected,
+            remedy=f"Name one with depth_channel=, for training data data.depth_channel=: {listed}",
+        )
+    return choices[0]
+
+
+def _is_depth(name: str, names: Sequence[str]) -> bool:
+    """Return True for a channel called depth, or Z or V in a layer called depth.
+
+    Z is also depth without a layer or in a layer with colors, but not beside X: others are parts of
+    vectors, or passes such as mist. A single channel without a layer, e.g. Y, is depth.
+    """
+    *layers, last = name.lower().split(".")
+    if last == "depth" or (layers[-1:] == ["depth"] and last in ("z", "v")):
+        return True
+    layer = "".join(f"{one}." for one in layers)
+    beside = {n.lower().removeprefix(layer) for n in names if n.lower().startswith(layer)}
+    has_colors = any(one.rpartition(".")[2] == "r" for one in beside)
+    is_z = last == "z" and "x" not in beside and (not layer or has_colors)
+    return is_z or (not layer and len(names) == 1)
 
 
 def write_exr(path: Path, pixels: NDArray[Any]) -> None:

@@ -223,7 +223,7 @@ def _tagged_part(tags: Mapping[str, str]) -> tuple[float, float, float, float]:
     ):
         return (math.nan,) * 4
     return (
-        left % full_width / full_width,
+        left / full_width,
         width / full_width,
         top / full_height,
         height / full_height,

@@ -28,6 +28,9 @@ _CONVERT = "Convert images of other formats, for example to JPEG or PNG."
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Suffixes of depth maps."""
 
+MOST_PIXELS = 32768 * 16384
+"""Largest image: a file of a few kilobytes can claim more than memory holds."""
+
 
 def image_paths(
     pattern: str | Path,

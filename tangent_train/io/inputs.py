@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.io.image_files import IMAGE_SUFFIXES, image_paths, short_names
-from tangent_train.io.videos import VIDEO_SUFFIXES, read_frames, read_video_size
+from tangent_train.io.videos import VIDEO_SUFFIXES, Frame, read_frames, read_video_size
 from tangent_train.manifest import MANIFEST
 from tangent_train.progress import progress_bar
 from tangent_train.threads import in_threads
@@ -30,6 +30,7 @@ class Job:
         path: File of the image or video.
         value: Input of the next step, at first the function that decodes a frame, or None; after
             the last step, the result.
+        place: Of a frame: its number in the video, and its time in seconds once it is decoded.
         error: Message of a failed step; empty if all succeeded.
     """
 
@@ -37,6 +38,7 @@ class Job:
     path: Path
     value: Any = None
     error: str = ""
+    place: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def is_frame(self) -> bool:
@@ -149,14 +151,16 @@ class Inputs:
         last = max(number for name, number in video.frames.items() if name in wanted)
         error = ""
         for name, number in video.frames.items():
-            frame = None
+            frame: Frame | None = None
+            place: dict[str, float] = {"frame": number}
             if number <= last and not error:
                 try:
                     frame = next(frames)
+                    place["time_s"] = round(frame.time_s, 6)
                 except DataError as damage:
                     error = str(damage)
             if name in wanted:
-                yield Job(name, video.path, frame, error)
+                yield Job(name, video.path, frame, error, place)
 
 
 def work_on(

@@ -24,7 +24,7 @@ from PIL.ExifTags import Base as Tag
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import atomic_path, reserve, write_bytes
 from tangent_train.io.exr import open_exr, write_exr
-from tangent_train.io.image_files import IMAGE_FORMATS, IMAGE_SUFFIXES
+from tangent_train.io.image_files import IMAGE_FORMATS, IMAGE_SUFFIXES, MOST_PIXELS
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 """Formats that change pixels slightly: not for labels and depth."""
@@ -46,9 +46,8 @@ _UNSIGNED = 1  # SampleFormat of TIFF
 _MAX_DEPTH_M = 1e4  # larger depth is missing: some files have 1e10 there
 _MISSING_UNITS = 65535
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
-_MOST_PIXELS = 32768 * 16384  # a file of a few kilobytes can claim more than memory holds
 
-Image.MAX_IMAGE_PIXELS = _MOST_PIXELS
+Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 
 
 class _StoredImage(NamedTuple):
@@ -66,16 +65,16 @@ class _StoredImage(NamedTuple):
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[_StoredImage]:
+def _opened(path: Path, channel: str | None = None) -> Iterator[_StoredImage]:
     """Open an image of an allowed size without decoding; errors in the block name the file."""
     try:
         # Not by its name: Pillow would map raw TIFF files into memory and rotate them wrongly.
         with path.open("rb") as file:
-            stored = _open_stored(path, file)
-            if not 0 < math.prod(stored.size) <= _MOST_PIXELS:
-                raise ValueError(f"{width_height(stored.size)}; 1 to {_MOST_PIXELS} pixels")  # noqa: TRY301
+            stored = _open_stored(path, file, channel)
+            if not 0 < math.prod(stored.size) <= MOST_PIXELS:
+                raise ValueError(f"{width_height(stored.size)}; 1 to {MOST_PIXELS} pixels")  # noqa: TRY301
             yield stored
-    except SettingError:  # a missing package
+    except (SettingError, DataError):  # a missing package, or no such channel
         raise
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
@@ -89,7 +88,7 @@ def _opened(path: Path) -> Iterator[_StoredImage]:
         ) from error
 
 
-def _open_stored(path: Path, file: IO[bytes]) -> _StoredImage:
+def _open_stored(path: Path, file: IO[bytes], channel: str | None) -> _StoredImage:
     suffix = path.suffix.lower()
     if suffix == ".npy":
         with np.errstate(over="ignore"):  # by the sizes in a broken header
@@ -98,7 +97,7 @@ def _open_stored(path: Path, file: IO[bytes]) -> _StoredImage:
         height, width, *_ = array.shape
         return _StoredImage((height, width), lambda _: array)
     if suffix == ".exr":
-        return _StoredImage(*open_exr(path))
+        return _StoredImage(*open_exr(path, channel))
     page = _deep_page(file) if suffix in _TIFF_SUFFIXES else None
     if page is not None:
         found = page.tags.valueof(Tag.Orientation)
@@ -221,12 +220,14 @@ def read_image_size(path: Path) -> tuple[int, int]:
         return (width, height) if stored.orientation >= _FIRST_TRANSPOSED else (height, width)
 
 
-def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
+def read_pixels(path: Path, *, indices: bool, channel: str | None = None) -> NDArray[Any]:
     """Read an image or an array as stored; alpha is dropped, the EXIF orientation applied.
 
     Args:
         path: An image of `IMAGE_FORMATS` (its first picture), OpenEXR (see `open_exr`) or ``.npy``.
-        indices: True to read indices, not colors, from images with a palette or of 1 bit.
+        indices: True to read indices, not colors, from images with a palette or of 1 bit, and
+            depth, not colors, from OpenEXR images.
+        channel: Channel of OpenEXR images; None as `open_exr` chooses it.
 
     Returns:
         ``(H, W)`` for one channel, else ``(H, W, C)``, colors in RGB order. Arrays are
@@ -235,7 +236,7 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
     Raises:
         DataError: The file cannot be read or is broken, or its array is not an image.
     """
-    with _opened(path) as stored:
+    with _opened(path, channel) as stored:
         return _displayed(stored.decode(indices), stored.orientation)
 
 
@@ -272,13 +273,14 @@ def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
     return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=-1)
 
 
-def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
+def read_depth_m(path: Path, units_per_m: float, channel: str | None = None) -> NDArray[np.float32]:
     """Read a depth map.
 
     Args:
         path: PNG, TIFF or array of integers, in units; or TIFF, array or OpenEXR image of
             floats, in meters.
         units_per_m: Units in a meter, 1000 for millimeters.
+        channel: Channel of OpenEXR images; None for the channel of depth, see `open_exr`.
 
     Returns:
         ``(H, W)`` meters; 0 where depth is missing: at values of 0 or less, NaN, infinity, more
@@ -287,7 +289,7 @@ def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
     Raises:
         DataError: The file cannot be read, is broken, or holds no depth.
     """
-    stored = read_pixels(path, indices=True)
+    stored = read_pixels(path, indices=True, channel=channel)
     is_usable = stored.ndim == 2 and stored.dtype not in (np.uint8, np.bool_)
     expected = "depth: 16-bit gray PNG or TIFF, 32-bit float TIFF, .npy or .exr"
     depth = _check_pixels(path, stored, expected, is_usable=is_usable).astype(np.float32)

@@ -40,6 +40,7 @@ def read_placed(
     interpolation: Interpolation,
     angles: Sequence[float] | None = None,
     frame: Callable[[], NDArray[np.uint8]] | None = None,
+    channel: str | None = None,
 ) -> tuple[NDArray[Any], PanoramaArea]:
     """Read a panorama of any dtype; place a part of a panorama on the whole sphere.
 
@@ -48,6 +49,7 @@ def read_placed(
         interpolation: With ``nearest``, images with a palette give its indices.
         angles: See `read_area`.
         frame: Function that returns the frame of a video.
+        channel: Channel of OpenEXR images, see `read_pixels`.
 
     Returns:
         ``(H, W)`` or ``(H, W, C)`` of the whole sphere, 0 outside of the part; and the part.
@@ -57,7 +59,8 @@ def read_placed(
         SettingError: The angles are invalid.
     """
     is_nearest = interpolation == "nearest"
-    image = frame() if frame else pixel_files.read_pixels(path, indices=is_nearest)
+    read = partial(pixel_files.read_pixels, indices=is_nearest, channel=channel)
+    image = frame() if frame else read(path)
     area = read_area(path, (image.shape[0], image.shape[1]), angles)
     return area.place(image), area
 
@@ -156,7 +159,11 @@ class TangentResults:
 
     @classmethod
     def read(
-        cls, files: Sequence[Path], grid: PinholeGrid, kind: ResultKind | Literal["auto"]
+        cls,
+        files: Sequence[Path],
+        grid: PinholeGrid,
+        kind: ResultKind | Literal["auto"],
+        channel: str | None = None,
     ) -> TangentResults:
         """Read and check result files.
 
@@ -166,12 +173,14 @@ class TangentResults:
             kind: ``auto`` decides by the first file: ``.npy`` of floats are features; three
                 channels are colors, one channel of integers labels; images of one channel with 16
                 bits or floats are depth.
+            channel: Channel of OpenEXR images, see `read_pixels`.
 
         Raises:
             DataError: A file cannot be read, differs from the others, cannot be of this kind, or
                 has another ratio of sides than the images.
         """
-        arrays = list(in_threads(partial(pixel_files.read_pixels, indices=kind != "color"), files))
+        read = partial(pixel_files.read_pixels, indices=kind != "color", channel=channel)
+        arrays = list(in_threads(read, files))
         first = arrays[0]
         decided = _kind_of(files[0], first) if kind == "auto" else kind
         channels = _CHANNELS.get(decided, (first.shape[2:],))

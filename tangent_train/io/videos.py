@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
-from functools import partial
+from dataclasses import dataclass
 from itertools import count, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +28,51 @@ _MISSING_S = 0.5
 
 _SHOWN_VP8 = 0x10
 _UPRIGHT_SIGNS = np.eye(2, dtype=np.int64)
+_SKEW = 0.02
+"""Entries of a display matrix may differ from a quarter turn by this: one degree."""
+_SQUARE = 0.01
+"""Pixels are square up to this rounding of their aspect ratio."""
+_MOST_ASPECT = 16
+_PQ, _HLG = 16, 18  # transfer functions of Rec. ITU-R BT.2100
+_SRGB: dict[str, Any] = {"dst_color_trc": 13, "dst_color_primaries": 1}
 _AHEAD = 2
+_USUAL_RATE = 30
 _ENCODER = "libx264"
 _QUALITY = {"crf": "18", "preset": "veryfast"}
 _BT709 = 1  # of the matrix, primaries and transfer: what players assume of large videos
+
+
+class _Display(NamedTuple):
+    """How the frames of a video are shown.
+
+    Attributes:
+        signs: ``(2, 2)`` signs of the transposed display matrix.
+        options: Arguments of PyAV's ``reformat``: a size of square pixels, colors of sRGB.
+    """
+
+    signs: NDArray[np.int64] = _UPRIGHT_SIGNS
+    options: dict[str, Any] = {}  # noqa: RUF012 - never changed
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A decoded frame; call it to convert it to upright RGB, ``(H, W, 3)`` uint8.
+
+    Attributes:
+        number: Number in the video, from 0.
+        time_s: Presentation time in seconds.
+        picture: Frame of PyAV.
+        display: How it is shown.
+    """
+
+    number: int
+    time_s: float
+    picture: Any
+    display: _Display
+
+    def __call__(self) -> NDArray[np.uint8]:
+        """Return upright RGB with square pixels, ``(H, W, 3)``."""
+        return _upright(self.picture, self.display)
 
 
 def read_video_size(path: Path) -> tuple[int, int, int]:
@@ -44,7 +85,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
         SettingError: PyAV is missing.
     """
     first, times, packets, end_s = None, [], 0, 0.0
-    with _opened(path) as (container, stream):
+    with open_video(path) as (container, stream):
         for packet in container.demux():
             if packet.pts is not None:
                 end = (packet.pts + (packet.duration or 0)) * packet.time_base
@@ -53,21 +94,20 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
                 packets += packet.size > 0
                 times += [packet.pts] if packet.size and _is_shown(packet) else []
                 first = first or next(iter(packet.decode()), None)
+        if first is None:
+            raise DataError(path, found="no frame that can be decoded", expected="a whole video")
+        shape = _upright(first, _display(path, stream, first)).shape
         indexed = sum(entry.size > 0 for entry in stream.index_entries)
         # MP4 files have an index of all frames, the others a duration.
         is_cut = (container.duration or 0) / _MICROSECONDS - end_s > _MISSING_S
         is_cut &= "mov" not in container.format.name
-    if first is None:
-        raise DataError(path, found="no frame that can be decoded", expected="a whole video")
     # Cutting without encoding leaves frames at the start that refer to missing ones.
     early = sum(None not in (time, first.pts) and time < first.pts for time in times)
     declared = max(indexed, packets + is_cut) - (packets - len(times)) - early
-    return declared, *_upright(first, _orientation(first)).shape[:2]
+    return declared, shape[0], shape[1]
 
 
-def read_frames(
-    path: Path, frames: int | None = None, every: int = 1
-) -> Generator[Callable[[], NDArray[np.uint8]]]:
+def read_frames(path: Path, frames: int | None = None, every: int = 1) -> Generator[Frame]:
     """Yield the first and then every n-th frame of a video, decoded in a thread a few ahead.
 
     Args:
@@ -76,29 +116,27 @@ def read_frames(
         every: Step n between frames.
 
     Yields:
-        Function that converts a frame to upright RGB, ``(H, W, 3)``.
+        Frames, which convert themselves to RGB when they are called.
 
     Raises:
         DataError: A frame is damaged, or the video ends before its declared length: after the
             frames that were read.
     """
-    for frame in _frames(path, read_video_size(path)[0] if frames is None else frames, every):
-        yield partial(_upright, *frame)
+    expected = read_video_size(path)[0] if frames is None else frames
 
-
-def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArray[np.int64]]]:
-    """Yield frames with their orientation, see `_orientation`."""
-
-    def decoded() -> Generator[tuple[Any, NDArray[np.int64]]]:
-        number, signs = 0, _UPRIGHT_SIGNS
-        with _opened(path) as (container, stream):
-            for frame in container.decode(stream):
-                if frame.is_corrupt:  # and frames before that refer to it
+    def decoded() -> Generator[Frame]:
+        number, display = 0, _Display()
+        with open_video(path) as (container, stream):
+            for picture in container.decode(stream):
+                if picture.is_corrupt:  # and frames before that refer to it
                     break
                 # Within an H.264 stream, only the first frame may have the matrix.
-                signs = _orientation(frame) if number == 0 else signs
+                display = _display(path, stream, picture) if number == 0 else display
                 if number % every == 0:
-                    yield frame, signs
+                    late = float(number / (stream.average_rate or _USUAL_RATE))
+                    yield Frame(
+                        number, late if picture.pts is None else picture.time, picture, display
+                    )
                 number += 1
         if number != expected:
             raise DataError(
@@ -110,12 +148,12 @@ def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArr
             )
 
     source = decoded()
-    with closing(in_threads(lambda _: next(source, None), count(), 1, _AHEAD)) as frames:
-        yield from takewhile(lambda frame: frame is not None, frames)
+    with closing(in_threads(lambda _: next(source, None), count(), 1, _AHEAD)) as read:
+        yield from takewhile(lambda frame: frame is not None, read)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+def open_video(path: Path) -> Iterator[tuple[Any, Any]]:
     """Return a context with a container and its video stream; its errors name the file."""
     with of_extra("video", path):
         import av
@@ -150,25 +188,45 @@ def _is_shown(packet: Any) -> bool:
     return not (packet.is_discard or hidden)
 
 
-def _orientation(frame: Any) -> NDArray[np.int64]:
-    """Return the signs ``(2, 2)`` of the transposed display matrix of a frame, or the identity.
+def _display(path: Path, stream: Any, frame: Any) -> _Display:
+    """Return how the frames of a video are shown, by its first frame.
 
-    The matrix M of ISO 14496-12 maps a stored pixel [x y 1] to the displayed pixel [x y 1] M. Other
-    rotations than by quarter turns are rounded to these.
+    The matrix M of ISO 14496-12 maps a stored pixel [x y 1] to the displayed pixel [x y 1] M. PQ
+    and HLG are converted to sRGB, where white is 203 cd/m² (Rec. ITU-R BT.2408).
+
+    Raises:
+        DataError: It is rotated by other angles than quarter turns, or its pixels are too long.
     """
-    data = frame.side_data.get("DISPLAYMATRIX")
-    if data is None:
-        return _UPRIGHT_SIGNS
-    # Its rows give the column and the row of a displayed pixel.
-    matrix = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T.astype(float)
-    return np.rint(matrix / np.maximum(abs(matrix).max(axis=1, keepdims=True), 1)).astype(np.int64)
+    signs, options, data = _UPRIGHT_SIGNS, {}, frame.side_data.get("DISPLAYMATRIX")
+    if data is not None:
+        # Its rows give the column and the row of a displayed pixel.
+        matrix = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T.astype(float)
+        matrix /= np.maximum(np.hypot(*matrix.T)[:, None], 1)
+        signs = np.rint(matrix).astype(np.int64)
+        if np.abs(matrix - signs).max() > _SKEW or abs(np.linalg.det(signs)) != 1:
+            raise DataError(
+                path,
+                found=f"a rotation by {np.degrees(np.arctan2(*matrix[0, ::-1])):.3g}°",
+                expected="a video that is shown rotated by 0, 90, 180 or 270°",
+                remedy="Export it again without rotation.",
+            )
+    aspect = float(stream.sample_aspect_ratio or 1)
+    if not 1 / _MOST_ASPECT <= aspect <= _MOST_ASPECT:
+        found = f"pixels {aspect:.3g} times as wide as high"
+        raise DataError(
+            path, found=found, expected=f"at most {_MOST_ASPECT} times, or a {_MOST_ASPECT}th"
+        )
+    if abs(aspect - 1) > _SQUARE:
+        options["width"] = round(frame.width * max(aspect, 1))
+        options["height"] = round(frame.height / min(aspect, 1))
+    return _Display(signs, options | (_SRGB if frame.color_trc in (_PQ, _HLG) else {}))
 
 
-def _upright(frame: Any, signs: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Convert a frame to RGB ``(H, W, 3)`` as players show it, by its `_orientation`."""
-    rgb: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
-    rgb = rgb if signs[0, 0] else rgb.swapaxes(0, 1)
-    column_step, row_step = signs.sum(axis=1)
+def _upright(frame: Any, display: _Display) -> NDArray[np.uint8]:
+    """Convert a frame to RGB ``(H, W, 3)`` as players show it, by its `_display`."""
+    rgb: NDArray[np.uint8] = frame.to_ndarray(format="rgb24", **display.options)
+    rgb = rgb if display.signs[0, 0] else rgb.swapaxes(0, 1)
+    column_step, row_step = display.signs.sum(axis=1)
     return np.ascontiguousarray(rgb[::row_step, ::column_step])
 
 
@@ -198,22 +256,21 @@ def write_video(
 
     expected, rows, columns = size
 
-    def painted(numbered: tuple[int, tuple[Any, NDArray[np.int64]]]) -> Any:
-        place, (frame, signs) = numbered
-        number = place * every
-        picture = np.ascontiguousarray(paint(number, _upright(frame, signs)))
+    def painted(frame: Frame) -> Any:
+        picture = np.ascontiguousarray(paint(frame.number, frame()))
         made = av.VideoFrame.from_ndarray(picture, format="rgb24")
         made = made.reformat(columns, rows, pixels, dst_colorspace=Colorspace.ITU709)
         made.time_base = stream.time_base
-        made.pts = number * step if frame.pts is None else frame.pts
+        pts = frame.picture.pts
+        made.pts = frame.number * step if pts is None else pts
         return made
 
     with (
         atomic_path(path) as temporary,
-        _opened(source) as (_, stream),
+        open_video(source) as (_, stream),
         av.open(_file_url(temporary), "w", format="mp4") as output,
     ):
-        rate = stream.average_rate or 30
+        rate = stream.average_rate or _USUAL_RATE
         step = max(1, round(1 / (rate * stream.time_base)))
         # Players expect colors at half the resolution, which requires an even size.
         pixels = "yuv444p" if rows % 2 or columns % 2 else "yuv420p"
@@ -222,8 +279,8 @@ def write_video(
         encoder.codec_context.time_base = stream.time_base
         encoder.codec_context.colorspace = encoder.codec_context.color_primaries = _BT709
         encoder.codec_context.color_trc = _BT709
-        numbered = enumerate(_frames(source, expected, every))
-        with closing(in_threads(painted, numbered, ahead=_AHEAD)) as frames:
+        read = read_frames(source, expected, every)
+        with closing(in_threads(painted, read, ahead=_AHEAD)) as frames:
             for frame in frames:
                 output.mux(encoder.encode(frame))
         output.mux(encoder.encode(None))

@@ -108,10 +108,9 @@ class PredictionFolder:
         if labels:
             lines = (f" {json.dumps(name)}: {values}" for name, values in labels.items())
             write_text(self.path / "classes.json", "{\n" + ",\n".join(lines) + "\n}\n")
-        columns, names = (
-            ["name", "file", "rows", "columns"],
-            dict.fromkeys(self.head.summary_columns),
-        )
+        place = ["frame", "time_s"] if any("frame" in entry for entry in entries) else []
+        columns = ["name", "file", *place, "rows", "columns"]
+        names = dict.fromkeys(self.head.summary_columns)
         rows = []
         for entry in entries:
             summary = entry.get(self.head.summary, {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from fractions import Fraction
 from pathlib import Path
@@ -88,6 +89,12 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
         assert np.abs(made - expected).mean() < 8  # compressed, with colors at half resolution
     entries = predicted(tmp_path / "out")
     assert len(entries) == 2 * len(TIMES)
+    with (tmp_path / "out" / "summary.csv").open(encoding="utf-8") as file:
+        rows = {row["name"]: row for row in csv.DictReader(file)}
+    for number, time in enumerate(TIMES):
+        row = rows[f"walk.mp4/{number:06d}"]
+        assert (int(row["frame"]), float(row["time_s"])) == (number, time / 16)
+    assert rows["walk/000003"]["frame"] == rows["walk/000003"]["time_s"] == ""
     assert entries["walk.mp4/000003"]["classes"] == entries["walk/000003"]["classes"]
 
 

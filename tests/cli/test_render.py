@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from tangent_train.geometry import TangentGrid, equirect_directions
@@ -35,6 +36,25 @@ def rendered(room: Path, tmp_path: Path) -> Path:
 
 
 # There and back.
+
+
+def test_channels_of_openexr_images(tmp_path: Path) -> None:
+    path, colors = tmp_path / "a.exr", smooth().astype(np.float32)
+    channels = {c: colors[..., i].copy() for i, c in enumerate("RGB")}
+    depth, mist = colors.sum(-1), -colors.sum(-1)
+    OpenEXR.File({}, {**channels, "Depth.Z": depth, "Mist.Z": mist}).write(str(path))
+    grid = TangentGrid(0, 5)
+    cases: list[tuple[dict[str, Any], Any]] = [
+        ({}, colors),
+        ({"interpolation": "nearest"}, depth),
+        ({"depth_channel": "Mist.Z"}, mist),
+    ]
+    for number, (settings, expected) in enumerate(cases):
+        output, kind = tmp_path / f"{number}", settings.get("interpolation", "bilinear")
+        render_with(input=path, output=output, base_level=0, format="npy", **settings)
+        views = np.stack([_read(file) for file in sorted((output / "a").glob("*.npy"))])
+        right = equirect_to_tangent(expected, grid, interpolation=kind)
+        np.testing.assert_allclose(views, right, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

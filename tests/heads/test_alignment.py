@@ -148,7 +148,9 @@ def test_scales_and_shifts_of_views_are_recovered(kind: Kind, views: str) -> Non
     assert np.abs(errors).max() < 1e-2
 
 
-@pytest.mark.parametrize(("kind", "views", "seed"), [("metric_z", "levels", 4)])
+@pytest.mark.parametrize(
+    ("kind", "views", "seed"), [("metric_z", "levels", 3), ("relative_depth", "cube", 2)]
+)
 def test_views_with_a_wrong_start_are_no_outliers(kind: Kind, views: str, seed: int) -> None:
     """Most views agree soon: if the unit of noise followed at once, the others would stay."""
     truth = _truth(views)

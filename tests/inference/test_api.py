@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from numpy.typing import NDArray
@@ -178,6 +179,12 @@ def test_depth_is_in_meters(tmp_path: Path, predicted: Predicted) -> None:
     cv2.imwrite(str(tmp_path / "depth" / "room.png"), steps)
     expected, _ = predicted(panorama, "depth=depth", "depth_scale=512")
     np.testing.assert_array_equal(network.labels(panorama, depth=depth_m), expected)
+    (tmp_path / "out").rename(tmp_path / "first")
+    (tmp_path / "depth" / "room.png").unlink()
+    channels = {"depth.Y": depth_m.astype(np.float32), "Normal.Z": np.ones((32, 64), np.float32)}
+    OpenEXR.File({}, channels).write(str(tmp_path / "depth" / "room.exr"))
+    of_channel, _ = predicted(panorama, "depth=depth", "depth_channel=depth.Y")
+    np.testing.assert_array_equal(of_channel, expected)
     depth_m[depth_m == 0] = np.nan
     tensors = torch.from_numpy(panorama).permute(2, 0, 1), torch.from_numpy(depth_m)
     np.testing.assert_array_equal(network.labels(tensors[0], depth=tensors[1]), expected)

@@ -95,6 +95,17 @@ def test_the_median_depth_of_a_photo_is_that_by_solid_angle() -> None:
     assert np.median(found / lengths) == pytest.approx(3, rel=0.01)
 
 
+def test_relative_depth_beyond_100_medians_is_unknown() -> None:
+    views = PinholeViews(TangentGrid(0, 5))
+    up = torch.from_numpy(views.grid.directions()[..., 2])[:, None].float()
+    depth = torch.where(up > 0.8, 150.0, torch.where(up > 0.5, 50.0, 1.0))
+    distance = depth / torch.from_numpy(views.ray_lengths())[:, None]
+    found = _combined([(views, distance)], SHAPE, "relative_depth", "nearest", "none")
+    heights = equirect_directions(SHAPE)[..., 2]
+    assert np.isnan(found[heights > 0.85]).all()
+    np.testing.assert_allclose(found[(heights > 0.55) & (heights < 0.75)], 50, rtol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

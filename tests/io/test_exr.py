@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import OpenEXR
 import pytest
 
 from tangent_train.errors import DataError
-from tangent_train.io.pixel_files import read_image_size, read_pixels
+from tangent_train.io.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 
 _DEPTH = np.fromfunction(lambda row, column: (row // 8 + column % 12) / 4 + 0.5, (40, 96)).astype(
     np.float32
@@ -23,27 +24,72 @@ def _write(path: Path, channels: dict[str, Any], **header: Any) -> Path:
     return path
 
 
+def _window(left: int, top: int, right: int, bottom: int) -> tuple[Any, Any]:
+    return np.array([left, top], np.int32), np.array([right, bottom], np.int32)
+
+
+def _tiles() -> Any:
+    tiles = OpenEXR.TileDescription()
+    tiles.xSize = tiles.ySize = 16
+    return tiles
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float16, np.uint32])
-@pytest.mark.parametrize("compression", [OpenEXR.NO_COMPRESSION, OpenEXR.PIZ_COMPRESSION])
-def test_pixels_are_as_written(tmp_path: Path, compression: Any, dtype: type[Any]) -> None:
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"compression": OpenEXR.NO_COMPRESSION},
+        {"compression": OpenEXR.PIZ_COMPRESSION, "lineOrder": OpenEXR.DECREASING_Y},
+        {"type": OpenEXR.tiledimage, "tiles": _tiles()},
+    ],
+)
+def test_pixels_are_as_written(tmp_path: Path, header: Any, dtype: type[Any]) -> None:
     depth = _DEPTH.astype(dtype)
-    window = (np.array([5, -7], np.int32), np.array([100, 32], np.int32))
-    path = _write(tmp_path / "ä (1).exr", {"Z": depth}, compression=compression, dataWindow=window)
+    path = _write(tmp_path / "ä (1).exr", {"Z": depth}, **header)
     read = read_pixels(path, indices=True)
     assert read.dtype == dtype
     np.testing.assert_array_equal(read, depth)
-    assert read_image_size(path) == (40, 96)
+
+
+@pytest.mark.parametrize(
+    "window",
+    [(0, 0, 95, 39), (10, 20, 105, 59), (-4, -6, 91, 33), (10, -5, 105, 34), (200, 9, 295, 48)],
+)
+def test_pixels_are_placed_in_the_display_window(tmp_path: Path, window: Any) -> None:
+    windows = {"dataWindow": _window(*window), "displayWindow": _window(0, 0, 95, 47)}
+    colors = np.stack([_DEPTH, 2 * _DEPTH, 3 * _DEPTH], -1)
+    channels: dict[str, Any] = {c: colors[..., i].copy() for i, c in enumerate("RGB")}
+    path = _write(tmp_path / "a.exr", {"Z": _DEPTH, **channels}, **windows)
+    expected = np.zeros((48, 96), np.float32)
+    for row, column in np.ndindex(_DEPTH.shape):
+        y, x = row + window[1], column + window[0]
+        if 0 <= y < 48 and 0 <= x < 96:
+            expected[y, x] = _DEPTH[row, column]
+    assert read_image_size(path) == (48, 96)
+    np.testing.assert_array_equal(read_depth_m(path, 1000), expected)
+    scaled = expected[..., None] * np.array([1, 2, 3], np.float32)
+    np.testing.assert_array_equal(read_pixels(path, indices=False), scaled)
+
+
+_RGBA = [*"RGBA"]
+_BLENDER = [f"L.{name}.{c}" for name in ("Combined", "Image") for c in "RGBA"]
+_NORMAL = ["L.Normal.X", "L.Normal.Y", "L.Normal.Z"]
 
 
 @pytest.mark.parametrize(
     ("others", "name"),
     [
         ([], "distance"),
-        (["R", "G", "B", "A"], "Z"),
-        (["L.R", "L.G", "L.B", "M.Normal.X"], "L.Depth.Z"),
-        (["R", "G", "B", "V"], "Y"),
-        (["G", "B"], "R"),
-        (["a.Y", "b.Y"], "V"),
+        ([], "Y"),
+        (_RGBA, "Z"),
+        (["Y", "RY", "BY"], "Z"),
+        (["R", "G", "B", "N.X", "N.Y", "N.Z"], "Z"),
+        (["main.R", "main.G", "main.B"], "main.Z"),
+        (_BLENDER, "L.Z"),
+        ([*_BLENDER, *_NORMAL, "L.Mist.Z", "L.Denoising Depth.Z"], "L.Depth.Z"),
+        ([*_NORMAL, "L.UV.U", "L.UV.V"], "L.Depth.V"),
+        (["L.Vector.X", "L.Vector.Y", "L.Vector.Z", "L.Vector.W"], "depth.Z"),
+        (["X", "Y", "Z"], "depth"),
     ],
 )
 def test_the_channel_of_depth_is_found(tmp_path: Path, others: list[str], name: str) -> None:
@@ -52,15 +98,83 @@ def test_the_channel_of_depth_is_found(tmp_path: Path, others: list[str], name: 
     np.testing.assert_array_equal(read_pixels(path, indices=True), _DEPTH)
 
 
-def test_several_parts_and_deep_pixels(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "names",
+    [
+        _RGBA,
+        _NORMAL,
+        ["X", "Y", "Z"],
+        [*_BLENDER, "L.Mist.Z"],
+        ["L.Mist.Z"],
+        [*_BLENDER, "L.UV.U", "L.UV.V"],
+        ["G", "B", "V", "Y"],
+        ["Depth.R", "Depth.G", "Depth.B", *_RGBA],
+        ["L.Depth.Z", "M.Depth.Z"],
+        ["Z", "depth.Z"],
+        ["R", "G", "B", "Z", "right.R", "right.G", "right.B", "right.Z"],
+    ],
+)
+def test_other_channels_are_refused_unless_named(tmp_path: Path, names: list[str]) -> None:
+    channels = {name: np.float32(1 + number) * _DEPTH for number, name in enumerate(names)}
+    path = _write(tmp_path / "a.exr", channels)
+    with pytest.raises(DataError) as caught:
+        read_depth_m(path, 1000)
+    listed = str(caught.value).partition("depth_channel=: ")[2].split(", ")
+    assert sorted(listed) == sorted(names)
+    for number, name in enumerate(names):
+        np.testing.assert_array_equal(
+            read_depth_m(path, 1000, name), np.float32(1 + number) * _DEPTH
+        )
+    with pytest.raises(DataError, match="expected channel albedo"):
+        read_depth_m(path, 1000, "albedo")
+
+
+def test_colors_are_those_of_the_only_layer(tmp_path: Path) -> None:
+    half = _DEPTH.astype(np.float16)
+    channels: dict[str, Any] = {"L.Combined.R": half, "L.Combined.G": 2 * half}
+    channels |= {"L.Combined.B": 3 * half, "L.Combined.A": half, "L.Depth.Z": _DEPTH}
+    path = _write(tmp_path / "a.exr", channels)
+    colors = read_pixels(path, indices=False)
+    assert colors.dtype == np.float32
+    np.testing.assert_array_equal(colors, np.stack([half, 2 * half, 3 * half], -1))
+    with pytest.raises(DataError, match="expected colors of 8 or 16 bits"):
+        read_rgb(path)
+    path = _write(path, channels | {f"L.DiffCol.{c}": half for c in "RGB"})
+    with pytest.raises(DataError, match="expected one layer with the channels R, G and B"):
+        read_pixels(path, indices=False)
+
+
+def _part(name: str, *channels: str, factor: float = 1) -> Any:
+    pixels = {channel: np.float32(factor) * _DEPTH for channel in channels}
+    return OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage}, pixels)
+
+
+@pytest.mark.parametrize(
+    "part", [("depth", "Z"), ("Z", "Z"), ("L.Depth", "L.Depth.V"), ("rest", "depth.Z")]
+)
+def test_parts_are_layers(tmp_path: Path, part: tuple[str, str]) -> None:
     path = tmp_path / "a.exr"
-    parts = [OpenEXR.Part({"name": name}, {"Z": _DEPTH}) for name in ("left", "right")]
-    OpenEXR.File(parts).write(str(path))
-    with pytest.raises(DataError, match=r"a\.exr: found .*2 parts"):
+    others = [_part("rgba", *"RGBA", factor=2), _part("normal", "X", "Y", "Z", factor=3)]
+    OpenEXR.File([*others, _part(*part)]).write(str(path))
+    np.testing.assert_array_equal(read_depth_m(path, 1000), _DEPTH)
+    np.testing.assert_array_equal(read_depth_m(path, 1000, "normal.Y"), 3 * _DEPTH)
+    np.testing.assert_array_equal(read_pixels(path, indices=False)[..., 1], 2 * _DEPTH)
+
+
+def test_unsuitable_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    OpenEXR.File([_part("left", "Z"), _part("right", "Z")]).write(str(path))
+    with pytest.raises(DataError, match=r"a\.exr: found none; .* left\.Z, right\.Z"):
         read_pixels(path, indices=True)
     deep = np.empty((4, 3), object)
     for place in np.ndindex(4, 3):
         deep[place] = np.ones(1 + place[0], np.float32)
     _write(path, {"Z": deep}, type=OpenEXR.deepscanline, compression=OpenEXR.ZIPS_COMPRESSION)
-    with pytest.raises(DataError, match=r"a\.exr: found"):
+    with pytest.raises(DataError, match=r"a\.exr: found .*several samples per pixel"):
         read_pixels(path, indices=True)
+    content = _write(path, {"Z": _DEPTH}).read_bytes()
+    end = content.index(b"dataWindow\0box2i\0") + len("dataWindow box2i ") + 4
+    for window in ((0, 0, 2**31 - 1, 2**31 - 1), (0, 0, 32767, 16384)):
+        path.write_bytes(content[:end] + struct.pack("<4i", *window) + content[end + 16 :])
+        with pytest.raises(DataError, match=r"a\.exr: found"):
+            read_image_size(path)

@@ -168,6 +168,15 @@ def test_resized_images_show_the_same(tmp_path: Path, size: tuple[int, int]) -> 
     assert abs(known.sum() - size[0] * size[1]) <= max(size)
 
 
+def test_a_left_edge_before_the_panorama_is_near_its_right_edge(tmp_path: Path) -> None:
+    """Stitchers write negative left edges of panoramas across ±180°."""
+    left = int(GPANO_TAGS["CroppedAreaLeftPixels"])
+    turn = int(GPANO_TAGS["FullPanoWidthPixels"])
+    tags = GPANO_TAGS | {"CroppedAreaLeftPixels": str(left - turn)}
+    area = read_area(_save(tmp_path / "before.jpg", tags), (40, 60))
+    assert area == read_area(_save(tmp_path / "image.jpg", GPANO_TAGS), (40, 60))
+
+
 def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.float64]:
     """Longitude and latitude of the upper left corner of a pixel."""
     return np.degrees(equirect_to_lonlat(np.subtract(corner_xy, 0.5), area.full_shape))

@@ -196,6 +196,92 @@ def test_frames_are_upright(tmp_path: Path, suffix: str, quarter_turns: int, mir
     assert np.abs(again - shown).mean() < 20  # compressed, with colors at half resolution
 
 
+@pytest.mark.parametrize("degrees", [3, 30, 45, 60, 100])
+def test_other_rotations_are_refused(tmp_path: Path, degrees: int) -> None:
+    path = _write(tmp_path / "a.mp4", setup=lambda stream: stream.set_display_rotation(degrees))
+    with pytest.raises(DataError, match=rf"a\.mp4: found a rotation by {degrees}°"):
+        read_video_size(path)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+@pytest.mark.parametrize("quarter_turns", [0, 1])
+@pytest.mark.parametrize(
+    ("stored", "aspect", "shown"),
+    [
+        ((64, 64), (2, 1), (64, 128)),
+        ((64, 128), (1, 2), (128, 128)),
+        ((64, 96), (4, 3), (64, 128)),
+        ((64, 128), (1001, 1000), (64, 128)),
+    ],
+)
+def test_the_display_size_decides(
+    tmp_path: Path,
+    suffix: str,
+    quarter_turns: int,
+    stored: tuple[int, int],
+    aspect: tuple[int, int],
+    shown: tuple[int, int],
+) -> None:
+    """The pixel aspect is that of stored pixels, before they are rotated."""
+
+    def setup(stream: Any) -> None:
+        stream.codec_context.sample_aspect_ratio = Fraction(*aspect)
+        stream.set_display_rotation(90 * quarter_turns)
+
+    rows, columns = (np.arange(n) for n in shown)
+    ramp = np.stack(np.broadcast_arrays(columns, 2 * rows[:, None], 0), axis=-1).astype(np.uint8)
+    picked = np.ix_(*((np.arange(n) + 0.5) * m / n for n, m in zip(stored, shown, strict=True)))
+    squeezed = np.ascontiguousarray(ramp[picked[0].astype(int), picked[1].astype(int)])
+    path = _write(tmp_path / f"a{suffix}", "lossless", [squeezed], setup=setup)
+    expected = np.rot90(ramp, quarter_turns)
+    assert read_video_size(path) == (1, *expected.shape[:2])
+    inner = np.s_[2:-2, 2:-2]
+    difference = np.abs(np.subtract(_read(path)[0], expected, dtype=float))[inner]
+    assert difference.max() <= 2, "half a pixel of the ramps, and rounding"
+
+
+def test_endless_pixels_are_refused(tmp_path: Path) -> None:
+    def setup(stream: Any) -> None:
+        stream.codec_context.sample_aspect_ratio = Fraction(30, 1)
+
+    with pytest.raises(DataError, match=r"found pixels 30 times as wide as high"):
+        read_video_size(_write(tmp_path / "a.mp4", setup=setup))
+
+
+def _pq_nits(signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Display light in cd/m² (SMPTE ST 2084)."""
+    power = signal ** (32 / 2523)
+    return 1e4 * (np.maximum(power - 107 / 128, 0) / (2413 / 128 - 2392 / 128 * power)) ** (
+        8192 / 1305
+    )
+
+
+def _hlg_nits(signal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Display light in cd/m² of a display of 1000 cd/m² (Rec. ITU-R BT.2100)."""
+    high = (np.exp((signal - 0.55991073) / 0.17883277) + 0.28466892) / 12
+    return 1000 * np.where(signal <= 0.5, signal**2 / 3, high) ** 1.2
+
+
+@pytest.mark.parametrize(("transfer", "nits"), [(16, _pq_nits), (18, _hlg_nits)])
+def test_high_dynamic_range_becomes_srgb(
+    tmp_path: Path, transfer: int, nits: Callable[[Any], Any]
+) -> None:
+    """A gray ramp; white is 203 cd/m² (Rec. ITU-R BT.2408)."""
+
+    def setup(stream: Any) -> None:
+        context = stream.codec_context
+        context.color_trc, context.color_primaries, context.colorspace = transfer, 9, 0
+
+    signal = np.tile(np.linspace(0, 1, 128), (64, 1))
+    gray = np.repeat(np.rint(255 * signal).astype(np.uint8)[..., None], 3, axis=-1)
+    path = _write(tmp_path / "a.mkv", "lossless", [gray], setup=setup)
+    light = np.minimum(nits(np.rint(255 * signal) / 255) / 203, 1)
+    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    shown = _read(path)[0].astype(float)
+    assert np.ptp(shown, axis=-1).max() <= 2, "gray remains gray"
+    assert np.abs(shown[..., 1] - 255 * srgb).max() <= 6
+
+
 @pytest.mark.parametrize(
     ("name", "settings"),
     [

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from numpy.typing import NDArray
@@ -156,6 +157,20 @@ def test_float_depth_of_a_folder_is_in_meters(tmp_path: Path, suffix: str) -> No
     labels = data.dataset("test")[0].labels.numpy()
     assert labels[0, : len(special)].tolist() == [0, 0, 0, 0, 1, 65531, 0, 0, 0]
     np.testing.assert_allclose(labels[1:] / 512, meters[1:], atol=0.5001 / 512)
+
+
+def test_a_channel_of_depth_can_be_named(tmp_path: Path) -> None:
+    for name in "abc":
+        save(tmp_path / "images" / f"{name}.png", np.zeros((32, 64, 3), np.uint8))
+        (tmp_path / "depth").mkdir(exist_ok=True)
+        channels = {c: np.full((32, 64), i + 1, np.float32) for i, c in enumerate("RGB")}
+        OpenEXR.File({}, channels).write(str(tmp_path / "depth" / f"{name}.exr"))
+    erp: Any = EquirectRepresentation(4)
+    problems, _ = _data(SOURCES["folder"], tmp_path, erp, val_fraction=0).check()
+    assert len(problems.listed()) == 3
+    assert all("data.depth_channel=: B, G, R" in one.remedy for one in problems.listed())
+    data = _data(SOURCES["folder"], tmp_path, erp, val_fraction=0, depth_channel="G")
+    assert data.dataset("test")[0].labels.unique().tolist() == [2 * 512]
 
 
 # --- masks, rotation ---------------------------------------------------------------
