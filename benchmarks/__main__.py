@@ -29,7 +29,9 @@ from torch.utils.collect_env import get_pretty_env_info
 from benchmarks.measuring import DEVICE, FAILURES, Table, attempted
 from tangent_train.results.tables import Table as TextTable
 
-MEASURED = {name: f"benchmarks.{name}" for name in ("images", "labels", "area", "depth", "methods")}
+MEASURED = {
+    name: f"benchmarks.{name}" for name in ("start", "images", "labels", "area", "depth", "methods")
+}
 MEASURED |= dict.fromkeys(("loader", "step", "evaluation"), "benchmarks.training")
 """Module of each benchmark; it has a function of the same name."""
 

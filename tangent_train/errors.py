@@ -198,15 +198,23 @@ def wrong_field(error: Any) -> str:
     return f"{wrong.subject}={wrong.found}, not {wrong.expected}"
 
 
-def at_least(name: str, value: object, least: int) -> int:
-    """Return a setting that has to be an integer, also of NumPy, not less than `least`.
+def at_least(name: str, value: object, least: int, most: int | None = None) -> int:
+    """Return a setting that has to be an integer, also of NumPy, from `least` to `most`.
 
     Raises:
         SettingError: The value is not such an integer.
     """
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise SettingError(name, found=value, expected=f"an integer of {least} or more")
-    return int(value)
+    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
+    if not is_integer or not least <= value <= (most or value):  # type: ignore[operator]
+        bounds = f"of {least} or more" if most is None else f"from {least} to {most}"
+        raise SettingError(name, found=repr(value), expected=f"an integer {bounds}")
+    return int(value)  # type: ignore[call-overload]
+
+
+def check_type(name: str, value: object, kinds: type | tuple[type, ...], expected: str) -> None:
+    """Raise TypeError unless an argument of the Python API is of one of some types."""
+    if not isinstance(value, kinds):
+        raise TypeError(f"{name}: found {type(value).__name__}; expected {expected}.")
 
 
 def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 import tangent_train
+from tangent_train.errors import SettingError
+from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tests.running import run_python
 
 
@@ -102,3 +105,44 @@ def test_modules_of_our_names_that_come_first_are_named(tmp_path: Path) -> None:
     (tmp_path / "models.py").write_text("")
     done = run_python(tmp_path, "-c", "import tangent_train")
     assert "models.py has the name of a package of tangent-train: rename it" in done.stderr
+
+
+GRID = tangent_train.TangentGrid(0, 3)
+PANORAMA = np.zeros((16, 32), np.uint8)
+
+
+@pytest.mark.parametrize("wrong", [[[0, 1]], "room.jpg", 5, None], ids=str)
+def test_arguments_of_other_types_are_named(wrong: Any) -> None:
+    size, tt = (16, 32), tangent_train
+    for name, call in {
+        "panorama": lambda: tt.equirect_to_tangent(wrong, GRID),
+        "grid": lambda: tt.equirect_to_tangent(PANORAMA, wrong),
+        "tangent images": lambda: tt.tangent_to_equirect(wrong, GRID, size),
+        "scores": lambda: tt.tangent_to_labels(wrong, GRID, size),
+        "function": lambda: tt.apply(wrong, PANORAMA, GRID),
+        "path": lambda: tt.load(5 if wrong == "room.jpg" else wrong),
+    }.items():
+        with pytest.raises(TypeError, match=f"^{name}: found [A-Za-z]+; expected "):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (
+            lambda: tangent_train.TangentGrid(0, 20),
+            "rows of an image: found 1048576; .* from 1 to 32768",
+        ),
+        (lambda: tangent_train.TangentGrid(9, 12), "base_level: found 9; .* from 0 to 8"),
+        (lambda: tangent_train.TangentGrid(-1, 4), "base_level: found -1; "),
+        (lambda: tangent_train.TangentGrid(0, 4.5), "level: found 4.5; expected an integer"),
+        (lambda: tangent_train.TangentGrid(0, 4, "16"), "dim: found '16'; expected an integer"),
+        (lambda: tangent_train.TangentGrid(0, 4, rotation=5), "rotation: found 5.0; "),
+        (lambda: tangent_train.equirect_to_tangent(PANORAMA, GRID, [20]), "faces: .*, 0 to 19"),
+        (lambda: TangentRepresentation(0, 15), "level: found 15; .* from 0 to 14"),
+        (lambda: EquirectRepresentation(4, erp_height=10**6), "erp_height: found 1000000; "),
+    ],
+)
+def test_sizes_and_indices_out_of_range_are_refused(build: Any, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        build()

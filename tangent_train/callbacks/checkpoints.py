@@ -149,7 +149,9 @@ class LastCheckpoint(Checkpoint):
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        """Print how to resume the run."""
+        """Print how to resume the run, unless an error of its first step would only be repeated."""
+        if trainer.global_step == 0 and isinstance(exception, Exception):
+            return
         if trainer.is_global_zero and self._has_begun and self.path.is_file():
             saved = "here" if isinstance(exception, SIGTERMException) else "the last checkpoint"
             command = f"tangent-train {shlex.quote(f'resume={self.path.parent.parent}')}"

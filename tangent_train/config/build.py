@@ -5,16 +5,33 @@ Sections of a file of somebody else are built by `tangent_train.config.from_file
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from inspect import signature
-from typing import Any
+from typing import Any, get_type_hints
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from pydantic import ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from typing_extensions import TypedDict
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import DataError, SettingError, wrong_setting
+
+_CHECKED = ("lightning.", "torch.optim.", "tangent_train.tasks.")
+"""Modules whose annotations are checked, and whose errors are explained: those of trainers,
+optimizers, schedules and tasks. Errors of other classes may be those of the user's own code."""
+
+
+class _ExplainedPartial(partial[Any]):
+    """A function whose errors name its section."""
+
+    place = target = ""
+
+    def __call__(self, *values: Any, **named: Any) -> Any:
+        """Call the function."""
+        with _explained(self.place, self.target):
+            return super().__call__(*values, **named)
 
 
 def build_from_config(section: Any, place: str, **given: Any) -> Any:
@@ -29,25 +46,54 @@ def build_from_config(section: Any, place: str, **given: Any) -> Any:
 
     Raises:
         SettingError: The class cannot be imported, or does not take its arguments. Other errors of
-            a class are raised unchanged.
+            a class are raised unchanged, except those of the libraries in `_CHECKED`.
     """
     if not isinstance(section, dict) or "_target_" not in section:
         raise SettingError(place, found=str(section), expected="a section with a _target_")
-    try:
+    target = str(section["_target_"])
+    with _explained(place, target):
         make = instantiate({"_convert_": "all", **section, "_partial_": True})
-        make = partial(make.func, *make.args, **make.keywords | given)
+        if target.startswith(_CHECKED):
+            _check_types(make.func, make.keywords, place)
+        make = _ExplainedPartial(make.func, *make.args, **make.keywords | given)
+        make.place, make.target = place, target
         is_partial = section.get("_partial_") is True
         if is_partial:  # other arguments are refused now, not when it is called
             signature(make.func).bind_partial(*make.args, **make.keywords)
         return make if is_partial else make()
+
+
+@contextmanager
+def _explained(place: str, target: str) -> Iterator[None]:
+    """Explain errors of a class or function that a section describes."""
+    try:
+        yield
     except Exception as error:
         cause = (error.__cause__ or error) if isinstance(error, InstantiationException) else error
         is_call = isinstance(cause, TypeError) and "argument" in str(cause)
         unfit = ImportError, InstantiationException, ValidationError
-        if not is_call and not isinstance(cause, unfit):
+        is_explained = is_call or isinstance(cause, unfit) or target.startswith(_CHECKED)
+        if not is_explained or isinstance(cause, DataError | SettingError):
             raise cause from None
-        found = f"{section['_target_']}, which cannot be built ({' '.join(str(cause).split())})"
+        found = f"{target}, which cannot be built ({' '.join(str(cause).split())})"
         raise SettingError(place, found=found, expected="settings that it accepts") from error
+
+
+def _check_types(function: Callable[..., Any], values: Mapping[str, Any], place: str) -> None:
+    """Raise SettingError unless values are of the types that a function declares."""
+    called: Any = function
+    try:
+        hints = get_type_hints(called.__init__ if isinstance(function, type) else called)
+    except NameError:  # names that are imported for type checkers only
+        return
+    kinds = {name: hints[name] for name, v in values.items() if name in hints and v is not None}
+    make: Any = TypedDict
+    arguments = make("arguments", kinds)
+    arguments.__pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
+    try:
+        TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
+    except ValidationError as error:
+        raise wrong_setting(error, {}, f"{place}.") from error
 
 
 def filled(section: Any, known: Mapping[str, Any]) -> Any:

@@ -43,6 +43,8 @@ _Item = TypeVar("_Item")
 OneOrMore = Annotated[tuple[_Item, ...], BeforeValidator(_as_list)]
 """A list; a single value is a list of it."""
 
+Level = Annotated[int, Field(ge=0, le=14)]
+Rows = Annotated[int, Field(gt=0, le=2**15)]
 ExistingPath = FilePath | DirectoryPath
 FieldOfView = Annotated[float, Field(gt=0, lt=180)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -121,7 +123,7 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy | erp |
     erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null = those of
     the checkpoint"""
-    levels: OneOrMore[int] | None = None
+    levels: OneOrMore[Level] | None = None
     """level s, or a list of levels of tangent images to average over; null = levels of the
     checkpoint"""
     base_level: int | None = None
@@ -178,7 +180,7 @@ class RenderSettings(ImageSettings):
     fov: 110}'; null = tangent"""
     base_level: int | None = None
     """base level b: 20·4^b tangent images; null = 1"""
-    level: int | None = None
+    level: Level | None = None
     """level s, the angular resolution; null = from the rows of each panorama"""
     dim: int | None = None
     """tangent images: side in pixels; smaller crops them, larger adds a margin; null = 2^(s−b).
@@ -213,7 +215,7 @@ class RenderSettings(ImageSettings):
     blend: Blend = "feather"
     """joins overlapping images: feather (weighted mean) | nearest; labels and depth are not
     averaged"""
-    height: PositiveInt | None = None
+    height: Rows | None = None
     """rows of the panorama; null = those of the original"""
     kind: Literal["auto", "color", "labels", "depth", "features"] = "auto"
     """kind of the results: auto | color | labels | depth | features"""
@@ -268,7 +270,7 @@ class ImportSettings(Settings):
     """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |
     erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null =
     horizontal_wide, or tangent with levels or base_level"""
-    levels: OneOrMore[int] | None = None
+    levels: OneOrMore[Level] | None = None
     """level s, or a list of levels of tangent images; null = from the side of its images, for
     tangent images two, e.g. [9, 8]"""
     base_level: int | None = None
@@ -299,7 +301,7 @@ class KeypointSettings(Settings):
     """pairs from input: consecutive (each panorama with the next) | all"""
     base_level: OneOrMore[int] = (0, 1, 2)
     """base levels b to compare, e.g. 1 or [0,1]: 20·4^b images each"""
-    level: int | None = None
+    level: Level | None = None
     """level s, the angular resolution, at most that of the panorama; null = from its rows"""
     margin: NonNegativeInt = 32
     """pixels added around tangent images, so that keypoints at borders are found"""
@@ -348,7 +350,7 @@ class RunSettings(Settings):
     """first folder below runs/"""
     seed: NonNegativeInt = 0
     """seed of initial weights, order, images and augmentation"""
-    level: int = 5
+    level: Level = 5
     """level s, the angular resolution: panoramas of 2^(s+1) rows"""
     panels: NonNegativeInt = 6
     """test images drawn as panels and shown in report.html (segmentation and depth)"""
@@ -394,7 +396,7 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
 
     representation: Section | None = None  # type: ignore[assignment]
     """views of a panorama that the network is given; null = those of the checkpoint"""
-    level: int | None = None  # type: ignore[assignment]
+    level: Level | None = None  # type: ignore[assignment]
     """level s, the angular resolution; null = that of the checkpoint"""
 
 
@@ -446,7 +448,7 @@ class TransferSettings(LabelMapSettings, RunSettings):
 
     name: str = "transfer"
     """folder below runs/transfer; the same name continues an interrupted transfer"""
-    level: int = 8
+    level: Level = 8
     """level s of the panoramas and of the crops of photos"""
     seeds: OneOrMore[int] | None = None
     """one transfer per seed, e.g. [0, 1, 2]; null = seed"""
@@ -464,9 +466,9 @@ class TransferSettings(LabelMapSettings, RunSettings):
     upright: auto}"""
     fine_tuning: FineTuningSettings
     """fine-tuning of P on photos (P-FT) and on panoramas (S-FT)"""
-    study_levels: OneOrMore[int] | None = None
+    study_levels: OneOrMore[Level] | None = None
     """evaluate P only, on panoramas of these levels, e.g. [5, 6, 7, 8, 9, 10]; null = off"""
-    study_max_rows: PositiveInt = 512
+    study_max_rows: Rows = 512
     """rows of the stored panoramas; finer levels are rendered from them"""
     photos: PhotoSettings
     """the photos"""

@@ -26,6 +26,7 @@ from tangent_train.geometry.grids import RingGrid as RingGrid
 from tangent_train.geometry.grids import TangentGrid as TangentGrid
 from tangent_train.geometry.icosphere import icosphere as icosphere
 from tangent_train.geometry.icosphere import vertex_resolution as vertex_resolution
+from tangent_train.geometry.sphere import MOST_ROWS as MOST_ROWS
 from tangent_train.geometry.sphere import PanoramaPose as PanoramaPose
 from tangent_train.geometry.sphere import checked_rotation as checked_rotation
 from tangent_train.geometry.sphere import equirect_directions as equirect_directions
@@ -38,6 +39,7 @@ from tangent_train.geometry.sphere import equirect_to_lonlat as equirect_to_lonl
 from tangent_train.geometry.sphere import lonlat_to_equirect as lonlat_to_equirect
 from tangent_train.geometry.sphere import lonlat_to_xyz as lonlat_to_xyz
 from tangent_train.geometry.sphere import nearest_level as nearest_level
+from tangent_train.geometry.sphere import panorama_rows as panorama_rows
 from tangent_train.geometry.sphere import random_rotation as random_rotation
 from tangent_train.geometry.sphere import rotation_about as rotation_about
 from tangent_train.geometry.sphere import to_right_handed as to_right_handed

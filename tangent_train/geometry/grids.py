@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from typing import Any, Self
@@ -12,11 +12,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError, at_least
+from tangent_train.errors import SettingError, at_least, check_type
 from tangent_train.geometry.camera import half_width
 from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.geometry.icosphere import icosphere, vertex_resolution
-from tangent_train.geometry.sphere import checked_rotation, lonlat_to_xyz, tangent_axes
+from tangent_train.geometry.sphere import MOST_ROWS, checked_rotation, lonlat_to_xyz, tangent_axes
 
 Faces = Sequence[int] | NDArray[np.integer]
 """Indices of images."""
@@ -42,7 +42,7 @@ class PinholeGrid:
         is_overlapping: True if every direction is inside an image, not only on its outer edge.
 
     Raises:
-        SettingError: The rotation is not a rotation.
+        SettingError: The rotation is not a rotation, or the size is out of range.
     """
 
     def __init__(
@@ -55,7 +55,10 @@ class PinholeGrid:
         is_overlapping: bool = True,
     ) -> None:
         self._axes = axes
-        self.size = size
+        self.size = (
+            at_least("rows of an image", size[0], 1, MOST_ROWS),
+            at_least("columns of an image", size[1], 1, MOST_ROWS),
+        )
         self.pitch = pitch
         self.rotation = None if rotation is None else checked_rotation(rotation)
         self.is_overlapping = is_overlapping
@@ -178,9 +181,21 @@ class PinholeGrid:
         return np.einsum("nwc,ijc->nijw", axes, rays)
 
     def face_indices(self, faces: Faces | None = None) -> NDArray[np.int64]:
-        """Return indices of images, by default of all; NumPy refuses others."""
+        """Return indices of images, by default of all.
+
+        Raises:
+            SettingError: There is no such image.
+            TypeError: It is not a list.
+        """
         every = np.arange(self.num_images)
-        return every if faces is None else every[[*faces]]
+        if faces is None:
+            return every
+        check_type("faces", faces, Iterable, "a list of indices, e.g. [0, 5]")
+        try:
+            return every[[*faces]]
+        except IndexError as error:
+            expected = f"indices of images, 0 to {self.num_images - 1}"
+            raise SettingError("faces", found=faces, expected=expected) from error
 
     def owners(self, directions_xyz: ArrayLike) -> NDArray[np.int64]:
         """Return the face that owns each direction: the face with the nearest center.
@@ -259,8 +274,8 @@ class TangentGrid(PinholeGrid):
         rotation: ``(3, 3)`` proper rotation R of the whole icosahedron: directions become R·d.
 
     Raises:
-        SettingError: The rotation is not a rotation, or `dim` would leave part of an owned cell
-            uncovered.
+        SettingError: The rotation is not a rotation, a level is out of range, or `dim` would leave
+            part of an owned cell uncovered.
 
     >>> grid = TangentGrid(base_level=1, level=10)
     >>> grid.num_images, grid.dim, round(grid.fov_deg, 4)
@@ -274,9 +289,11 @@ class TangentGrid(PinholeGrid):
         dim: int | None = None,
         rotation: ArrayLike | None = None,
     ) -> None:
+        at_least("base_level", base_level, 0, 8)
+        at_least("level", level, 0)
         dim = int(2.0 ** (level - base_level)) if dim is None else dim
         least = self.least_dim(base_level, level)
-        if dim < least:
+        if at_least("dim", dim, 0) < least:
             raise SettingError(
                 "dim",
                 found=dim,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tangent_train.errors import at_least
 from tangent_train.geometry.sphere import lonlat_to_xyz
 
 if TYPE_CHECKING:
@@ -95,9 +96,13 @@ def icosphere(level: int) -> Icosphere:
     Returns:
         10·4^level + 2 vertices and 20·4^level faces; children of face f are 4f … 4f+3. Read-only.
 
+    Raises:
+        SettingError: The level is out of range.
+
     >>> icosphere(1).faces.shape
     (80, 3)
     """
+    at_least("level of the icosphere", level, 0, 8)
     mesh = _icosahedron() if level == 0 else _subdivide(icosphere(level - 1))
     for array in mesh:
         array.setflags(write=False)

@@ -11,7 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
+
+MOST_ROWS = 2**15
+"""Rows of a panorama, and sides of an image, at most: 2 gigapixels."""
 
 
 def lonlat_to_xyz(lonlat_rad: ArrayLike) -> NDArray[np.float64]:
@@ -92,8 +95,15 @@ def checked_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
     Raises:
         SettingError: The matrix is not a proper rotation.
     """
-    matrix = np.array(rotation, np.float64)
-    if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) or np.linalg.det(matrix) < 0:
+    try:
+        matrix = np.array(rotation, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.array(repr(rotation))
+    if (
+        matrix.shape != (3, 3)
+        or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6)
+        or np.linalg.det(matrix) < 0
+    ):
         raise SettingError(
             "rotation", found=matrix.tolist(), expected="a 3×3 rotation matrix of determinant +1"
         )
@@ -105,15 +115,30 @@ def equirect_shape(level: int) -> tuple[int, int]:
     """Return rows and columns of the panorama that matches a level-s icosahedron.
 
     Args:
-        level: Level s, 0 or more.
+        level: Level s, 0 to 14.
 
     Returns:
         ``(2 ** (s + 1), 2 ** (s + 2))`` (paper, figure "icosahedral levels").
 
+    Raises:
+        SettingError: The level is out of range.
+
     >>> equirect_shape(10)
     (2048, 4096)
     """
+    at_least("level", level, 0, 14)
     return 2 ** (level + 1), 2 ** (level + 2)
+
+
+def panorama_rows(level: int, rows: int | None) -> int:
+    """Return rows of a panorama; None for those of level s, see `equirect_shape`.
+
+    Raises:
+        SettingError: The level or the number is out of range.
+    """
+    if rows is None:
+        return equirect_shape(level)[0]
+    return at_least("representation.erp_height", rows, 1, MOST_ROWS)
 
 
 def nearest_level(height: int) -> int:

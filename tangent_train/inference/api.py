@@ -35,7 +35,7 @@ from datamodules.core.label_map import (
     read_label_map,
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.errors import SettingError, check_choice, width_height
+from tangent_train.errors import SettingError, check_choice, check_type, width_height
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
@@ -53,7 +53,7 @@ from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
-from tangent_train.rendering.forward import blend_of, check_panorama
+from tangent_train.rendering.forward import blend_of, check_grid, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.resampling import Pixels, reduce_to_pitch
@@ -117,6 +117,7 @@ def load(
         DataError: A file cannot be used.
         SettingError: A setting does not suit the network.
     """
+    check_type("path", path, (str, Path), "the path of a network's file")
     original = loaded = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
     if label_map is not None:
         loaded = map_classes(original, load_label_map(label_map), unmapped).loaded
@@ -364,6 +365,8 @@ def apply(
     >>> apply(brightness, np.full((32, 64, 3), 0.5), TangentGrid(0, 4))[0, 0]
     np.float32(0.5)
     """
+    check_type("function", function, Callable, "a function of images")  # type: ignore[arg-type]
+    check_grid(grid)
     blend = blend_of(blend, is_overlapping=grid.is_overlapping)
     check_panorama(panorama, "bilinear")
     step = images_per_call or views_per_forward(grid.size)
@@ -443,6 +446,7 @@ def load_label_map(given: str | Path) -> LabelMap:
         SettingError: There is no map of this name.
         DataError: The file is missing or is not a valid label map.
     """
+    check_type("label_map", given, (str, Path), "a name or a path")
     folder = Path(__file__).with_name("label_maps")
     shipped = sorted(path.stem for path in folder.glob("*.json"))
     if str(given) in shipped:

@@ -68,7 +68,10 @@ def image_paths(
     skipped = Counter(file.suffix.lower() or "without suffix" for file in found.difference(images))
     kinds = ", ".join(f"{count} {repr(kind)[1:-1]}" for kind, count in sorted(skipped.items()))
     if not images:
-        others = f"{len(found)} files, none of them an image: {kinds}" if found else "nothing"
+        others = (
+            "nothing" if path.exists() or glob.has_magic(str(path)) else "no such file or folder"
+        )
+        others = f"{len(found)} files, none of them an image: {kinds}" if found else others
         raise DataError(
             pattern,
             found="only results of this command" if files and not found else others,

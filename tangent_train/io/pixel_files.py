@@ -7,6 +7,7 @@ than 8 bits, OpenEXR its own format; OpenCV writes.
 from __future__ import annotations
 
 import math
+import mmap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -21,6 +22,7 @@ from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image
 from PIL.ExifTags import Base as Tag
 
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import atomic_path, reserve, write_bytes
 from tangent_train.io.exr import open_exr, write_exr
@@ -41,6 +43,8 @@ READABLE_SUFFIXES = (*_WRITABLE, ".npy", ".exr")
 """Suffixes that `read_pixels` takes, in lower case."""
 
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
+_FULL_RANGE = 2**14  # 16-bit colors below it probably have 14 bits or fewer
+_has_warned = mmap.mmap(-1, 1)  # shared with forked processes, which read training data
 _FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
 _UNSIGNED = 1  # SampleFormat of TIFF
 _MAX_DEPTH_M = 1e4  # larger depth is missing: some files have 1e10 there
@@ -76,6 +80,8 @@ def _opened(path: Path, channel: str | None = None) -> Iterator[_StoredImage]:
             yield stored
     except (SettingError, DataError):  # a missing package, or no such channel
         raise
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise DataError(path, found=error, expected="an image file") from error
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
         reason = getattr(error, "strerror", None) or str(error).partition(" <")[0]
@@ -249,11 +255,22 @@ def _check_pixels(
     return pixels
 
 
+def _warn_of_range(subject: object, largest: int) -> None:
+    """Print, once in a run, that 16-bit colors have fewer bits."""
+    if 0 < largest < _FULL_RANGE and not _has_warned[0]:
+        _has_warned[0] = 1
+        print_text(
+            f"Warning: {subject}: the largest value of 16-bit colors is {largest}, of 65535; they "
+            "are read as dark. If images have fewer bits, scale their values to 65535.",
+            error=True,
+        )
+
+
 def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
     """Decode the colors of an image, ``(H, W, 3)``.
 
-    The upper 8 of 16 bits per channel are kept; gray becomes three equal channels; alpha is
-    dropped; the EXIF orientation is applied.
+    The upper 8 of 16 bits per channel are kept, with a warning if they are dark; gray becomes
+    three equal channels; alpha is dropped; the EXIF orientation is applied.
 
     Args:
         image: A file of `IMAGE_FORMATS`, or a Pillow image, which is not changed.
@@ -266,6 +283,7 @@ def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
     else:
         pixels = _displayed(_decode(image.copy(), indices=False), _orientation(image))
     if pixels.dtype == np.uint16:
+        _warn_of_range(image if isinstance(image, Path) else "image", int(pixels.max()))
         pixels = (pixels >> 8).astype(np.uint8)
     subject = image if isinstance(image, Path) else "image"
     is_usable = pixels.dtype == np.uint8 and pixels.shape[2:] in ((), (3,))

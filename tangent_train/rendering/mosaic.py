@@ -18,6 +18,8 @@ from torch import Tensor
 from tangent_train.rendering.forward import (
     Blend,
     blend_of,
+    check_array,
+    check_grid,
     check_images,
     check_interpolation,
     check_shape,
@@ -275,6 +277,8 @@ def tangent_to_equirect(
     Raises:
         SettingError: The images, the shape, the blend or the interpolation cannot be used.
     """
+    check_array("tangent images", images)
+    check_grid(grid)
     blend = blend_of(blend, is_overlapping=grid.is_overlapping)
     check_interpolation(interpolation, blend)
     shape = check_shape(shape)
@@ -316,6 +320,8 @@ def tangent_to_labels(
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
     """
+    check_array("scores", logits)
+    check_grid(grid)
     scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
     blend = blend_of(blend, is_overlapping=grid.is_overlapping)
     shape = check_shape(shape)

@@ -354,8 +354,13 @@ class PixelTask(Task):
         found = tuple(outputs["out"].shape)
         expected = (len(images), self.head.num_outputs, *images.shape[-2:])
         if found != expected:
-            remedy = "Set network.num_classes to the number of classes, or to null."
-            name = "output of the network"
+            name, remedy = "output of the network", ""
+            if found[2:] != expected[2:]:
+                remedy = (
+                    "A network returns a score for every pixel of its input: enlarge its output."
+                )
+            elif found[1:2] != expected[1:2]:
+                remedy = "Set network.num_classes to the number of classes, or to null."
             raise SettingError(name, found=found, expected=expected, remedy=remedy)
         return outputs
 

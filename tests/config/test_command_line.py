@@ -45,6 +45,7 @@ def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
         ("render a(1).jpg", "Did you mean 'input=\"a(1).jpg\"'?"),
         ("train fast", "fast: found a word without =; .*tangent-train --help lists them."),
         ("train experiment=rooms/demoo", "experiment: found rooms/demoo; .*mean rooms/demo?"),
+        ("train recipe=small recipe/task=small_mine", "recipe/task: found small_mine; "),
         ("train data=5", "Config group override must be a string or a list. Got int"),
         ("train data.root=~/x", f"in full: data.root={Path('~/x').expanduser()}"),
         ("train data.root=r(a", "Quote other characters: 'data.root=\"r(a\"'"),

@@ -72,6 +72,8 @@ def test_a_recipe_sets_what_the_task_has(task: str) -> None:
         ("train", ["+sed=1"], r"^sed: found 1; expected a known setting\. Did you mean seed\?"),
         ("export", ["checkpoint=none.ckpt", "output=x"], r"^checkpoint: found none\.ckpt; .*exist"),
         ("export", [f"checkpoint={CONFIGS}"], r"^output: found nothing; expected file: \.onnx"),
+        ("train", ["level=20"], r"^level: found 20; .*less than or equal to 14"),
+        ("predict", [*GIVEN["predict"], "levels=[9,20]"], "^levels: found 20; .*equal to 14"),
         ("keypoints", ["output=x", "pairing=some"], "^pairing: .*'consecutive' or 'all'"),
         ("keypoints", ["output=x", "base_level=[a]"], r"^base_level: found a; .*integer"),
         (

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms, TiffImagePlugin, features
 
 from tangent_train.errors import DataError, SettingError
+from tangent_train.io import pixel_files
 from tangent_train.io.pixel_files import (
     check_writable,
     photo_fov_deg,
@@ -407,3 +408,21 @@ def test_truncated_files_are_named(tmp_path: Path, missing: slice, dtype: Any) -
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"image\.png: found no image that can be decoded"):
         read_pixels(path, indices=False)
+
+
+@pytest.mark.parametrize(
+    ("bits", "suffix"), [(10, ".png"), (12, ".tif"), (14, ".png"), (16, ".png")]
+)
+def test_colors_of_few_bits_are_warned_of_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], bits: int, suffix: str
+) -> None:
+    pixel_files._has_warned[0] = 0
+    for name in "ab":
+        path = tmp_path / f"{name}{suffix}"
+        write_pixels(path, np.full((4, 8, 3), 2**bits - 1, np.uint16))
+        read_rgb(path)
+    printed = capsys.readouterr().err
+    assert printed.count("Warning: ") == (bits < 16)
+    assert (f"a{suffix}: the largest value of 16-bit colors is {2**bits - 1}," in printed) == (
+        bits < 16
+    )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError, at_least, check_choice
-from tangent_train.geometry import equirect_shape, random_rotation
+from tangent_train.geometry import MOST_ROWS, panorama_rows, random_rotation
 from tangent_train.rendering.forward import Blend, rotate_equirect
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
@@ -120,11 +120,11 @@ class EquirectRepresentation:
         if crop_deg is not None and not 0 < crop_deg <= 360:
             raise SettingError("representation.crop_deg", found=crop_deg, expected="0 to 360")
         if rows is not None:
-            at_least("representation.rows", rows, 1)
+            at_least("representation.rows", rows, 1, MOST_ROWS)
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
         at_least("representation.rotations", rotations, 1)
-        self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
+        self.erp_height = panorama_rows(level, erp_height)
         self.crop_deg = crop_deg
         self.random_rotation = random_rotation
         self.mirror = mirror

@@ -22,6 +22,7 @@ from tangent_train.geometry import (
     equirect_shape,
     icosphere,
     lonlat_to_equirect,
+    panorama_rows,
     random_rotation,
     rotation_about,
     to_right_handed,
@@ -251,7 +252,7 @@ class IcosphereRepresentation:
         self.random_rotation = random_rotation
         self.mirror = mirror
         self.interpolation = interpolation
-        self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
+        self.erp_height = panorama_rows(level, erp_height)
         self._rotations = vertical_rotations(rotations, _SYMMETRY_DEG)
         self._rotation: NDArray[np.float64] = np.eye(3)
 

@@ -17,6 +17,7 @@ from tangent_train.geometry import (
     RingGrid,
     TangentGrid,
     equirect_shape,
+    panorama_rows,
     random_rotation,
     rotation_about,
 )
@@ -86,7 +87,7 @@ class PinholeRepresentation:
         self.grid: PinholeGrid = grid
         self.random_rotation = random_rotation
         self.mirror = mirror
-        self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
+        self.erp_height = panorama_rows(level, erp_height)
         self.blend = blend
         self.faces_per_panorama = faces_per_panorama
         self.grids = grids
