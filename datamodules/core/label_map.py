@@ -157,8 +157,9 @@ class LabelMap:
         Raises:
             DataError: The file is broken, holds other values, or colors instead of values.
         """
-        stored = read_rgb(path) if self.in_colors else read_pixels(path, indices=True)
-        if stored.ndim == 3 and not self.in_colors:
+        is_colored = self.in_colors
+        stored = read_rgb(path, as_stored=True) if is_colored else read_pixels(path, indices=True)
+        if stored.ndim == 3 and not is_colored:
             raise DataError(path, found="colors", expected="values of classes, one per pixel")
         return self.decode(stored, path)
 

@@ -106,9 +106,10 @@ class LabeledFolder(ImageDataModule):
         paths = list(image_files.walk_files(folder))
         self.problems.note_absent(str(folder), {_name(folder, path) for path in paths} - names)
         folder = self.root / "images"
-        suffixes = {path.suffix.lower() for path in image_files.walk_files(folder)}
-        if others := sorted(suffixes - {*image_files.IMAGE_SUFFIXES}):
-            self.problems.warnings.append(f"{folder}: files {', '.join(others)} are not images")
+        others = {*image_files.walk_files(folder)} - {files.rgb for files in images}
+        suffixes = {path.suffix.lower() for path in others}
+        if unknown := sorted(suffixes - {*image_files.IMAGE_SUFFIXES}):
+            self.problems.warnings.append(f"{folder}: files {', '.join(unknown)} are not images")
 
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`."""

@@ -7,13 +7,20 @@ import os
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePath
 
 from PIL import Image
 
 from tangent_train.errors import DataError
 
-IMAGE_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF")
+with suppress(ImportError):  # the extra `heif`
+    import pillow_heif
+
+    pillow_heif.register_heif_opener()
+
+_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "GIF", "AVIF", "HEIF")
+IMAGE_FORMATS = tuple(sorted({*_FORMATS} & {*Image.registered_extensions().values()}))
 """Pillow's names of the formats that are read; AVIF where Pillow was built with it."""
 
 IMAGE_SUFFIXES = tuple(
@@ -22,6 +29,19 @@ IMAGE_SUFFIXES = tuple(
     )
 )
 """Suffixes of images, in lower case."""
+
+HEIF_SUFFIXES = (".heic", ".heics", ".heif", ".heifs", ".hif")
+"""Suffixes of HEIF images, which are read with the extra ``heif``."""
+
+_OTHER_SUFFIXES = (
+    *(".jxl", ".jp2", ".j2k", ".jpx", ".jpf", ".jxr", ".avif", ".insp", ".gpr", ".psd", ".tga"),
+    *(".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw"),
+    *(".hdr", ".pnm", ".ppm", ".pgm", ".pfm", ".svg", ".ico", ".dds", ".qoi", ".jls", ".pcx"),
+)
+"""Suffixes of images that are not read: such files are listed, and refused when they are read."""
+
+_SYSTEM_NAMES = {"thumbs.db", "ehthumbs.db", "desktop.ini", "@eadir", "#recycle", "$recycle.bin"}
+"""Names in lower case that Windows and network storage write into folders of images."""
 
 _CONVERT = "Convert images of other formats, for example to JPEG or PNG."
 
@@ -49,7 +69,7 @@ def image_paths(
 
     Returns:
         Sorted paths. From folders and patterns: visible files with one of the suffixes, in lower
-        or upper case.
+        or upper case, and images of formats that are not read.
 
     Raises:
         DataError: No image was found, or a folder cannot be opened.
@@ -62,9 +82,10 @@ def image_paths(
     else:
         named = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
     # Broken links are kept, so that reading them is an error.
-    files = {file for file in named if not file.is_dir() and not file.name.startswith(".")}
+    files = {file for file in named if not file.is_dir() and is_wanted(file, path)}
     found = {file for file in files if not is_result(file)}
-    images = sorted(file for file in found if file.suffix.lower() in suffixes)
+    known = {*suffixes, *HEIF_SUFFIXES, *_OTHER_SUFFIXES}
+    images = sorted(file for file in found if file.suffix.lower() in known)
     skipped = Counter(file.suffix.lower() or "without suffix" for file in found.difference(images))
     kinds = ", ".join(f"{count} {repr(kind)[1:-1]}" for kind, count in sorted(skipped.items()))
     if not images:
@@ -84,11 +105,26 @@ def image_paths(
     return images
 
 
+def is_wanted(path: Path, folder: Path = Path()) -> bool:
+    """Return False for hidden files, and for files and folders of an operating system.
+
+    Args:
+        path: File or folder.
+        folder: Parent folder, or pattern, whose own name may be any.
+
+    >>> [is_wanted(Path(name)) for name in ("a.jpg", ".DS_Store", "Thumbs.db", "@eaDir/a.jpg")]
+    [True, False, False, False]
+    """
+    inside = {part.lower() for part in path.parts} - {part.lower() for part in folder.parts}
+    return not path.name.startswith(".") and not inside & _SYSTEM_NAMES
+
+
 def walk_files(folder: Path) -> Iterator[Path]:
     """Yield files of a folder and its subfolders, linked ones included, each folder once.
 
     Args:
-        folder: A folder, which may be missing; hidden files and folders are left out.
+        folder: A folder, which may be missing; only files and folders that are wanted, see
+            `is_wanted`.
 
     Raises:
         DataError: A folder cannot be opened.
@@ -98,8 +134,9 @@ def walk_files(folder: Path) -> Iterator[Path]:
         return
     for parent, folders, names in os.walk(folder, followlinks=True, onerror=_refuse):
         real = os.path.realpath(parent)
-        folders[:] = [] if real in seen else [name for name in folders if name[0] != "."]
-        yield from (Path(parent, name) for name in names if real not in seen and name[0] != ".")
+        folders[:] = [] if real in seen else [name for name in folders if is_wanted(Path(name))]
+        wanted = [] if real in seen else [name for name in names if is_wanted(Path(name))]
+        yield from (Path(parent, name) for name in wanted)
         seen.add(real)
 
 
@@ -119,8 +156,18 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
+def lower_suffix(name: str) -> str:
+    """Return the name of a file with its suffix in lower case.
+
+    >>> lower_suffix("Hall/P1.PNG")
+    'Hall/P1.png'
+    """
+    suffix = PurePath(name).suffix
+    return name.removesuffix(suffix) + suffix.lower()
+
+
 class NamedFiles:
-    """Files of a folder and its subfolders by `composed` names.
+    """Files of a folder and its subfolders by `composed` names; suffixes in lower or upper case.
 
     Args:
         folder: The folder, which may be missing.
@@ -131,8 +178,8 @@ class NamedFiles:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        names = ((path.relative_to(folder).as_posix(), path) for path in walk_files(folder))
-        self._found = {composed(name): path for name, path in names}
+        files = {composed(p.relative_to(folder).as_posix()): p for p in walk_files(folder)}
+        self._found = {lower_suffix(name): path for name, path in files.items()} | files
 
     def path(self, name: str) -> Path:
         """Return the path of a file, which may be missing; see `composed`.
@@ -140,7 +187,8 @@ class NamedFiles:
         Args:
             name: Name of the file relative to the folder.
         """
-        return self._found.get(composed(name), self.folder / name)
+        name = composed(name)
+        return self._found.get(name) or self._found.get(lower_suffix(name), self.folder / name)
 
 
 def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:

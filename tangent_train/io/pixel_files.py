@@ -1,7 +1,7 @@
 """Reading and writing images: colors, depth, labels, arrays.
 
-Pillow decodes images of 8 bits, tifffile TIFF files of more than 8 bits, OpenCV PNG and LZW of more
-than 8 bits, OpenEXR its own format; OpenCV writes.
+`decoders` decodes images of 8 bits, tifffile TIFF files of more than 8 bits, OpenCV PNG and LZW of
+more than 8 bits, OpenEXR its own format; OpenCV writes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -23,10 +23,16 @@ from PIL import ExifTags, Image
 from PIL.ExifTags import Base as Tag
 
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, width_height
+from tangent_train.errors import DataError, SettingError, of_extra, width_height
 from tangent_train.files import atomic_path, reserve, write_bytes
+from tangent_train.io.decoders import decode_by_opencv, deep_to_srgb, load_whole, to_srgb
 from tangent_train.io.exr import open_exr, write_exr
-from tangent_train.io.image_files import IMAGE_FORMATS, IMAGE_SUFFIXES, MOST_PIXELS
+from tangent_train.io.image_files import (
+    HEIF_SUFFIXES,
+    IMAGE_FORMATS,
+    IMAGE_SUFFIXES,
+    MOST_PIXELS,
+)
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 """Formats that change pixels slightly: not for labels and depth."""
@@ -54,18 +60,24 @@ _FILM_DIAGONAL_MM = math.hypot(36, 24)
 Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 
 
+_Meaning = Literal["indices", "values", "colors"]
+"""Pixels as indices of a palette, as stored values, or as colors in sRGB."""
+
+
 class _StoredImage(NamedTuple):
     """An open image file.
 
     Attributes:
         size: Rows and columns as stored.
-        decode: Returns the stored pixels, given True for indices instead of colors.
+        decode: Returns the pixels, as one of `_Meaning`.
         orientation: EXIF orientation of these pixels, 1 to 8.
+        profile: ICC profile of colors of more than 8 bits, which are decoded as stored.
     """
 
     size: tuple[int, int]
-    decode: Callable[[bool], NDArray[Any]]
+    decode: Callable[[Any], NDArray[Any]]
     orientation: int = 1
+    profile: bytes | None = None
 
 
 @contextmanager
@@ -103,20 +115,26 @@ def _open_stored(path: Path, file: IO[bytes], channel: str | None) -> _StoredIma
         height, width, *_ = array.shape
         return _StoredImage((height, width), lambda _: array)
     if suffix == ".exr":
-        return _StoredImage(*open_exr(path, channel))
+        size, decode_exr = open_exr(path, channel)
+        return _StoredImage(size, lambda meaning: decode_exr(meaning == "indices"))
+    if suffix in HEIF_SUFFIXES:
+        with of_extra("heif", path, "Or convert the file to JPEG."):
+            import pillow_heif  # noqa: F401
     page = _deep_page(file) if suffix in _TIFF_SUFFIXES else None
     if page is not None:
         found = page.tags.valueof(Tag.Orientation)
         orientation = found if found in range(1, 9) else 1
         decode = partial(_decode_deep_tiff, file, page)
-        return _StoredImage((page.imagelength, page.imagewidth), decode, orientation)
+        profile = page.tags.valueof(Tag.InterColorProfile)
+        return _StoredImage((page.imagelength, page.imagewidth), decode, orientation, profile)
     file.seek(0)
     image = Image.open(file, formats=IMAGE_FORMATS)
-    decode = partial(_decode, image)
+    decode, profile = partial(_decode, image, file), None
     layout = str(image.tile[0][3]) if image.format == "PNG" else ""
     if layout.endswith("16B"):  # Pillow would cut colors to 8 bits
         decode = partial(_decode_deep_png, file, image, layout.startswith("LA"))
-    return _StoredImage((image.height, image.width), decode, _orientation(image))
+        profile = image.info.get("icc_profile")
+    return _StoredImage((image.height, image.width), decode, _orientation(image), profile)
 
 
 def _orientation(image: Image.Image) -> int:
@@ -131,33 +149,36 @@ def _orientation(image: Image.Image) -> int:
     return found if found in range(1, 9) else 1
 
 
-def _decode(image: Image.Image, indices: bool) -> NDArray[Any]:
-    image.load()
-    if image.mode in _SINGLE_CHANNEL or (image.mode in ("1", "P") and indices):
+def _decode(image: Image.Image, file: IO[bytes] | None, meaning: _Meaning) -> NDArray[Any]:
+    """Decode an image of 8 bits from its file, or one that is decoded already."""
+    whole = image if file is None else load_whole(image, file)
+    profile = image.info.get("icc_profile") if meaning == "colors" else None
+    if isinstance(whole, np.ndarray) and not profile:
+        return whole
+    image = Image.fromarray(whole) if isinstance(whole, np.ndarray) else whole
+    is_single = image.mode in _SINGLE_CHANNEL and not (meaning == "colors" and image.mode == "L")
+    if is_single or (image.mode in ("1", "P") and meaning == "indices"):
         stored = np.array(image, np.uint8 if image.mode == "1" else None)
         return stored.astype(stored.dtype.newbyteorder("="), copy=False)
-    if image.mode == "LA":
-        return np.array(image.getchannel(0))
     if image.mode == "YCbCr":
         raise ValueError("subsampled colors")
     image.info.pop("transparency", None)  # Pillow warns that RGB loses it
-    return np.array(image if image.mode == "RGB" else image.convert("RGB"))
-
-
-def _decode_by_opencv(file: IO[bytes]) -> NDArray[Any]:
-    # From memory: `cv2.imread` cannot open paths beyond the system's code page.
-    file.seek(0)
-    content = np.frombuffer(file.read(), np.uint8)
-    pixels: Any = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
-    return pixels if pixels.ndim == 2 else pixels[..., 2::-1]
+    if image.mode == "LA":
+        image = image.getchannel(0)
+    elif image.mode not in ("L", "RGB", "CMYK"):
+        profile = None if image.mode == "LAB" else profile
+        image = image.convert("RGB")
+    image = to_srgb(image, profile, getattr(file, "name", "image"))
+    return np.array(image if image.mode in ("L", "RGB") else image.convert("RGB"))
 
 
 def _decode_deep_png(
-    file: IO[bytes], image: Image.Image, is_gray_alpha: bool, indices: bool
+    file: IO[bytes], image: Image.Image, is_gray_alpha: bool, meaning: _Meaning
 ) -> NDArray[Any]:
-    del indices
-    image.load()  # refuses truncated files
-    pixels = _decode_by_opencv(file)
+    del meaning
+    load_whole(image, file)
+    pixels = decode_by_opencv(file, cv2.IMREAD_UNCHANGED)
+    pixels = pixels if pixels.ndim == 2 else pixels[..., 2::-1]
     return pixels[..., 0] if is_gray_alpha else pixels
 
 
@@ -173,9 +194,9 @@ def _deep_page(file: IO[bytes]) -> Any:
     return None if is_shallow and page.index == 0 else page
 
 
-def _decode_deep_tiff(file: IO[bytes], page: Any, indices: bool) -> NDArray[Any]:
+def _decode_deep_tiff(file: IO[bytes], page: Any, meaning: _Meaning) -> NDArray[Any]:
     """Decode the gray or RGB pixels of a page, without alpha."""
-    del indices
+    del meaning
     channels = page.samplesperpixel
     colors = tifffile.PHOTOMETRIC.MINISBLACK if channels == 1 else tifffile.PHOTOMETRIC.RGB
     is_plain = channels in (1, 3, 4) and page.photometric == colors
@@ -184,7 +205,8 @@ def _decode_deep_tiff(file: IO[bytes], page: Any, indices: bool) -> NDArray[Any]
     is_lzw = page.compression == tifffile.COMPRESSION.LZW  # tifffile needs another package for it
     if not is_plain or (is_lzw and (is_planar or page.index)):
         raise ValueError(f"TIFF layout: {channels} channels, {page.photometric!r}")
-    pixels = _decode_by_opencv(file) if is_lzw else page.asarray()
+    pixels = decode_by_opencv(file, cv2.IMREAD_UNCHANGED) if is_lzw else page.asarray()
+    pixels = pixels[..., 2::-1] if is_lzw and channels > 1 else pixels
     pixels = np.moveaxis(pixels, 0, -1) if is_planar else pixels
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     return pixels if channels == 1 else pixels[..., :3]
@@ -226,13 +248,16 @@ def read_image_size(path: Path) -> tuple[int, int]:
         return (width, height) if stored.orientation >= _FIRST_TRANSPOSED else (height, width)
 
 
-def read_pixels(path: Path, *, indices: bool, channel: str | None = None) -> NDArray[Any]:
+def read_pixels(
+    path: Path, *, indices: bool, in_srgb: bool = False, channel: str | None = None
+) -> NDArray[Any]:
     """Read an image or an array as stored; alpha is dropped, the EXIF orientation applied.
 
     Args:
         path: An image of `IMAGE_FORMATS` (its first picture), OpenEXR (see `open_exr`) or ``.npy``.
         indices: True to read indices, not colors, from images with a palette or of 1 bit, and
             depth, not colors, from OpenEXR images.
+        in_srgb: True to convert colors by an embedded color profile to sRGB.
         channel: Channel of OpenEXR images; None as `open_exr` chooses it.
 
     Returns:
@@ -243,7 +268,10 @@ def read_pixels(path: Path, *, indices: bool, channel: str | None = None) -> NDA
         DataError: The file cannot be read or is broken, or its array is not an image.
     """
     with _opened(path, channel) as stored:
-        return _displayed(stored.decode(indices), stored.orientation)
+        pixels = stored.decode("indices" if indices else "colors" if in_srgb else "values")
+        if in_srgb and stored.profile and pixels.dtype == np.uint16:
+            pixels = deep_to_srgb(pixels, stored.profile, path)
+        return _displayed(pixels, stored.orientation)
 
 
 def _check_pixels(
@@ -266,22 +294,23 @@ def _warn_of_range(subject: object, largest: int) -> None:
         )
 
 
-def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
-    """Decode the colors of an image, ``(H, W, 3)``.
+def read_rgb(image: Path | Image.Image, *, as_stored: bool = False) -> NDArray[np.uint8]:
+    """Decode the colors of an image, ``(H, W, 3)``, in sRGB.
 
-    The upper 8 of 16 bits per channel are kept, with a warning if they are dark; gray becomes
+    An embedded color profile is applied; the upper 8 of 16 bits per channel are kept; gray becomes
     three equal channels; alpha is dropped; the EXIF orientation is applied.
 
     Args:
         image: A file of `IMAGE_FORMATS`, or a Pillow image, which is not changed.
+        as_stored: True to ignore the profile, e.g. for labels in colors.
 
     Raises:
         DataError: The file cannot be read, is broken, or does not hold colors.
     """
     if isinstance(image, Path):
-        pixels = read_pixels(image, indices=False)
+        pixels = read_pixels(image, indices=False, in_srgb=not as_stored)
     else:
-        pixels = _displayed(_decode(image.copy(), indices=False), _orientation(image))
+        pixels = _displayed(_decode(image.copy(), None, "colors"), _orientation(image))
     if pixels.dtype == np.uint16:
         _warn_of_range(image if isinstance(image, Path) else "image", int(pixels.max()))
         pixels = (pixels >> 8).astype(np.uint8)

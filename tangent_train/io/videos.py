@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -35,6 +36,9 @@ _SQUARE = 0.01
 _MOST_ASPECT = 16
 _PQ, _HLG = 16, 18  # transfer functions of Rec. ITU-R BT.2100
 _SRGB: dict[str, Any] = {"dst_color_trc": 13, "dst_color_primaries": 1}
+_PROJECTIONS = {1: "a cube map", 3: "half a sphere", 5: "a fisheye picture"}
+_STEREO = dict.fromkeys(range(1, 8), "two eyes (stereo)")
+"""Values of FFmpeg's side data, ``AVSphericalProjection`` and ``AVStereo3DType``."""
 _AHEAD = 2
 _USUAL_RATE = 30
 _ENCODER = "libx264"
@@ -96,6 +100,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
                 first = first or next(iter(packet.decode()), None)
         if first is None:
             raise DataError(path, found="no frame that can be decoded", expected="a whole video")
+        _check_layout(path, first)
         shape = _upright(first, _display(path, stream, first)).shape
         indexed = sum(entry.size > 0 for entry in stream.index_entries)
         # MP4 files have an index of all frames, the others a duration.
@@ -220,6 +225,22 @@ def _display(path: Path, stream: Any, frame: Any) -> _Display:
         options["width"] = round(frame.width * max(aspect, 1))
         options["height"] = round(frame.height / min(aspect, 1))
     return _Display(signs, options | (_SRGB if frame.color_trc in (_PQ, _HLG) else {}))
+
+
+def _check_layout(path: Path, frame: Any) -> None:
+    """Refuse a video whose side data name another layout than one equirectangular picture."""
+    kinds = {"SPHERICAL": _PROJECTIONS, "STEREO3D": _STEREO}
+    for kind, names in kinds.items():
+        data = frame.side_data.get(kind)
+        number = 0 if data is None else int.from_bytes(bytes(data)[:4], sys.byteorder)
+        if number in names:
+            raise DataError(
+                path,
+                found=f"a video with {names[number]}, by its metadata",
+                expected="one equirectangular picture, or a photo, in each frame",
+                remedy="Convert it, for example with FFmpeg's filter v360 or stereo3d. To remove "
+                "wrong metadata: ffmpeg -i <video> -c copy <new>.mp4.",
+            )
 
 
 def _upright(frame: Any, display: _Display) -> NDArray[np.uint8]:

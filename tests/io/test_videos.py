@@ -240,6 +240,50 @@ def test_the_display_size_decides(
     assert difference.max() <= 2, "half a pixel of the ramps, and rounding"
 
 
+def _box(name: bytes, *content: bytes) -> bytes:
+    return struct.pack(">I4s", 8 + sum(map(len, content)), name) + b"".join(content)
+
+
+def _insert(path: Path, new: bytes) -> None:
+    """Insert boxes at the end of the sample entry of an MP4 file, whose moov box is its last."""
+    data, place, starts = bytearray(path.read_bytes()), 0, []
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"):
+        while data[place + 4 : place + 8] != name:
+            place += struct.unpack_from(">I", data, place)[0]
+        starts.append(place)
+        place += 8 + {b"stsd": 8, b"avc1": 78}.get(name, 0)
+    end = starts[-1] + struct.unpack_from(">I", data, starts[-1])[0]
+    data[end:end] = new
+    for start in starts:
+        struct.pack_into(">I", data, start, struct.unpack_from(">I", data, start)[0] + len(new))
+    path.write_bytes(data)
+
+
+def _projection(content: bytes) -> bytes:
+    header = _box(b"prhd", bytes(16))
+    return _box(b"sv3d", _box(b"svhd", bytes(5)), _box(b"proj", header, content))
+
+
+@pytest.mark.parametrize(
+    ("boxes", "found"),
+    [
+        (_projection(_box(b"equi", bytes(20))), ""),
+        (_projection(_box(b"cbmp", bytes(12))), "a cube map"),
+        (_box(b"st3d", bytes(4), b"\1"), "two eyes"),
+        (_box(b"st3d", bytes(4), b"\2") + _projection(_box(b"equi", bytes(20))), "two eyes"),
+    ],
+)
+def test_layouts_that_the_metadata_name(tmp_path: Path, boxes: bytes, found: str) -> None:
+    """Boxes of Google's Spherical Video V2."""
+    path = _write(tmp_path / "a.mp4")
+    _insert(path, boxes)
+    if not found:
+        assert read_video_size(path) == (_COUNT, 64, 128)
+        return
+    with pytest.raises(DataError, match=f"found a video with {found}"):
+        read_video_size(path)
+
+
 def test_endless_pixels_are_refused(tmp_path: Path) -> None:
     def setup(stream: Any) -> None:
         stream.codec_context.sample_aspect_ratio = Fraction(30, 1)
