@@ -60,7 +60,7 @@ class FCNResNet(nn.Module):
         if weights is not None:
             tensors = _tensors(self, str(weights), depth)
             with_head = any(name.startswith(_HEAD) for name in tensors)
-            load_tensors(self, tensors, fresh=_LAST if with_head else _HEAD)
+            load_tensors(self, tensors, weights, fresh=_LAST if with_head else _HEAD)
         widen_stem(self.backbone, in_channels)
         self.train()
 

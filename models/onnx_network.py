@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.errors import DataError, SettingError, of_extra
+from tangent_train.errors import DataError, SettingError, first_line, of_extra
 
 _TYPES = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16}
 _COLORS = 3
@@ -29,6 +29,7 @@ class OnnxNetwork(nn.Module):
     Args:
         path: ONNX file with one input ``(B, C, h, w)`` or ``(B, h, w, 3)``, float32 or float16,
             and one output: scores (channels first or last) or label maps, of any resolution.
+            onnxruntime reads weights in files of their own (external data) from its folder only.
 
     Attributes:
         path: ONNX file.
@@ -56,8 +57,9 @@ class OnnxNetwork(nn.Module):
             options.add_session_config_entry("session.load_model_format", "ONNX")
             self._session = onnxruntime.InferenceSession(path, options, providers=providers)
         except Exception as error:  # the parser of protocol buffers raises many kinds of errors
-            found = f"an unreadable file ({str(error).partition(chr(10))[0]})"
-            raise DataError(path, found=found, expected="an ONNX file") from error
+            found = f"an unreadable file ({first_line(error).rpartition('Error: ')[2]})"
+            expected = "an ONNX file; weights in files of their own are in its folder"
+            raise DataError(path, found=found, expected=expected) from error
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if [(len(i.shape), i.type in _TYPES) for i in inputs] != [(4, True)] or len(outputs) != 1:
             found = ", ".join(f"{one.name} {one.type} {one.shape}" for one in [*inputs, *outputs])

@@ -126,22 +126,36 @@ def fetch_tensors(weights: str) -> dict[str, Tensor]:
     )
 
 
+def first_difference(error: Exception) -> str:
+    """Return the first difference that torch lists below the title of its message."""
+    lines = str(error).splitlines()
+    return (lines[1] if len(lines) > 1 else str(error)).strip()
+
+
 def load_tensors(
-    network: nn.Module, tensors: Mapping[str, Tensor], fresh: str | None = None
+    network: nn.Module, tensors: Mapping[str, Tensor], source: object, fresh: str | None = None
 ) -> None:
-    """Load all tensors of a network; torch refuses missing, unexpected and unfitting ones.
+    """Load all tensors of a network.
 
     Args:
         network: Network, changed in place.
         tensors: Tensors by name.
+        source: File of the tensors, for the message.
         fresh: Prefix of the names of tensors that are not loaded; None to load all.
+
+    Raises:
+        DataError: Tensors are missing, unexpected or of another shape.
     """
     kept = {
         name: tensor
         for name, tensor in network.state_dict().items()
         if _COUNTER in name or (fresh is not None and name.startswith(fresh))
     }
-    network.load_state_dict({**kept, **tensors})
+    try:
+        network.load_state_dict({**kept, **tensors})
+    except (RuntimeError, TypeError, AttributeError) as error:
+        expected = f"all tensors of {type(network).__name__}, for the same classes and settings"
+        raise DataError(source, found=first_difference(error), expected=expected) from error
 
 
 def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:

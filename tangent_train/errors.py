@@ -174,6 +174,9 @@ def wrong_setting(error: Any, known: Mapping[str, str], prefix: str = "") -> Set
     """
     # An unknown name first: it may be meant for a missing one.
     first = min(error.errors(), key=lambda one: _EXPECTED.get(one["type"]) != _UNKNOWN)
+    cause = first.get("ctx", {}).get("error")
+    if not first["loc"] and isinstance(cause, SettingError):  # of several settings together
+        return cause
     same = [one for one in error.errors() if one["loc"][:1] == first["loc"][:1]]
     parts = zip(*(one["loc"] for one in same), strict=False)
     common = takewhile(lambda part: len({*part}) == 1 and isinstance(part[0], str), parts)

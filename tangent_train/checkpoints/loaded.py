@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from datamodules.core.inputs import Input, Normalization, channel_names
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
+from models.pretrained import first_difference
 from tangent_train.checkpoints.outputs import OutputNetwork
 from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
@@ -267,17 +268,11 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
     except (RuntimeError, TypeError, AttributeError) as error:
         raise DataError(
             path,
-            found=f"other tensors than those of its network ({_first_difference(error)})",
+            found=f"other tensors than those of its network ({first_difference(error)})",
             expected=f"the tensors of {settings['_target_']}",
             remedy="Install the version of the network's package that it was trained with.",
         ) from error
     return LoadedNetwork(**vars(described), module=module.eval(), trust=tuple(trust))
-
-
-def _first_difference(error: Exception) -> str:
-    """Return the first difference that torch lists below the title of its message."""
-    lines = str(error).splitlines()
-    return first_line(lines[1] if len(lines) > 1 else error).strip()
 
 
 def read_description(path: Path) -> NetworkDescription | None:
@@ -323,16 +318,24 @@ def _parsed(path: Path, content: Any) -> NetworkDescription | None:
 
 
 def write_onnx_description(source: Path, path: Path, described: NetworkDescription) -> None:
-    """Write an ONNX file with the description of its network.
+    """Write an ONNX file with all weights and the description of its network.
 
     Args:
-        source: ONNX file without external tensors.
+        source: ONNX file; its weights may be in other files of its folder.
         path: File to write.
         described: Network that the ONNX file computes.
+
+    Raises:
+        DataError: The weights are behind links, or larger than one ONNX file can be.
     """
     import onnx
 
-    graph = onnx.load(source, format="protobuf")
-    entries = {entry.key: entry.value for entry in graph.metadata_props}
-    onnx.helper.set_model_props(graph, entries | {METADATA_KEY: json.dumps(described.plain())})
-    onnx.save(graph, path, format="protobuf")
+    try:
+        graph = onnx.load(source, format="protobuf")
+        entries = {entry.key: entry.value for entry in graph.metadata_props}
+        onnx.helper.set_model_props(graph, entries | {METADATA_KEY: json.dumps(described.plain())})
+        content = graph.SerializeToString()
+    except Exception as error:  # onnx and protobuf raise kinds of their own
+        expected = "weights in the file, or in a copy (not a link) beside it, below 2 GB"
+        raise DataError(source, found=first_line(error), expected=expected) from error
+    path.write_bytes(content)

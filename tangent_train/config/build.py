@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, wraps
 from inspect import signature
-from typing import Any, get_type_hints
+from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -17,6 +17,9 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
 from tangent_train.errors import DataError, SettingError, wrong_setting
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 _CHECKED = ("lightning.", "torch.optim.", "tangent_train.tasks.")
 """Modules whose annotations are checked, and whose errors are explained: those of trainers,
@@ -54,7 +57,7 @@ def build_from_config(section: Any, place: str, **given: Any) -> Any:
     with _explained(place, target):
         make = instantiate({"_convert_": "all", **section, "_partial_": True})
         if target.startswith(_CHECKED):
-            _check_types(make.func, make.keywords, place)
+            check_types(make.func, make.keywords, f"{place}.")
         make = _ExplainedPartial(make.func, *make.args, **make.keywords | given)
         make.place, make.target = place, target
         is_partial = section.get("_partial_") is True
@@ -79,21 +82,44 @@ def _explained(place: str, target: str) -> Iterator[None]:
         raise SettingError(place, found=found, expected="settings that it accepts") from error
 
 
-def _check_types(function: Callable[..., Any], values: Mapping[str, Any], place: str) -> None:
-    """Raise SettingError unless values are of the types that a function declares."""
+def check_types(
+    function: Callable[..., Any], values: Mapping[str, Any], prefix: str = ""
+) -> dict[str, Any]:
+    """Return arguments as the types that a function declares, other than None.
+
+    Args:
+        function: Function or class.
+        values: Arguments by name.
+        prefix: Prefix of the names in messages.
+
+    Raises:
+        SettingError: A value is of another type.
+    """
     called: Any = function
     try:
         hints = get_type_hints(called.__init__ if isinstance(function, type) else called)
     except NameError:  # names that are imported for type checkers only
-        return
+        return {**values}
     kinds = {name: hints[name] for name, v in values.items() if name in hints and v is not None}
     make: Any = TypedDict
     arguments = make("arguments", kinds)
     arguments.__pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
     try:
-        TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
+        typed = TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
     except ValidationError as error:
-        raise wrong_setting(error, {}, f"{place}.") from error
+        raise wrong_setting(error, {}, prefix) from error
+    return {**values, **typed}
+
+
+def checks_types(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Decorate a function whose arguments by name are checked with `check_types`."""
+
+    @wraps(function)
+    def checked(*values: _Arguments.args, **named: _Arguments.kwargs) -> _Result:
+        typed: Any = check_types(function, named)
+        return function(*values, **typed)
+
+    return checked
 
 
 def filled(section: Any, known: Mapping[str, Any]) -> Any:

@@ -27,6 +27,7 @@ from pydantic import (
     PositiveFloat,
     PositiveInt,
     ValidationError,
+    model_validator,
 )
 from pydantic.fields import FieldInfo
 
@@ -289,9 +290,25 @@ class ImportSettings(Settings):
     fov: FieldOfView = 60
     """horizontal field of view of its photos in degrees; predictions on photos use it"""
     output: Path
-    """file: .ckpt, or .onnx for library=onnx"""
+    """file to write: .ckpt, or .onnx for library=onnx"""
     overwrite: bool = False
     """true: replace an existing file"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _check_source(cls, values: dict[str, Any]) -> dict[str, Any]:
+        """Refuse settings that name no trained network."""
+        is_own = values.get("network") is not None
+        if values.get("library") is None and not (is_own and values.get("weights")):
+            options = sorted(path.stem for path in (config_folder() / "network").glob("*.yaml"))
+            raise SettingError(
+                "weights" if is_own else "library",
+                found="null",
+                expected="a trained network, which tangent-import writes as a checkpoint: library="
+                "torchvision, huggingface, smp or onnx; or network= with weights=<its file>",
+                remedy=f"Options of network=: {', '.join(options)}. To train one: tangent-train.",
+            )
+        return values
 
 
 class KeypointSettings(Settings):

@@ -6,7 +6,8 @@ The convention is stated in `tangent_train.geometry`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -273,13 +274,15 @@ def check_area(angles: Sequence[float] | None, setting: str = "area") -> tuple[f
     """
     if angles is None:
         return -180, 180, -90, 90
-    west, east, south, north = angles if len(angles) == 4 else (0, 0, 0, 0)
+    given = [*angles] if isinstance(angles, Iterable) else [angles]
+    is_area = len(given) == 4 and all(isinstance(angle, Real) for angle in given)
+    west, east, south, north = given if is_area else (0, 0, 0, 0)
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south < north <= 90) or (
         (east - west) % 360 == 0 and (west, east) != (-180, 180)
     ):
         raise SettingError(
             setting,
-            found=list(angles),
+            found=given,
             expected="[west,east,south,north] in degrees, −180 to 180 and −90 to 90, south below "
             "north, east other than west; [-180,180,…] is all around",
         )

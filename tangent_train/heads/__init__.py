@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from pydantic import ValidationError
+
+from tangent_train.errors import wrong_setting
 from tangent_train.heads.base import Head, PredictedImage, Scores
 from tangent_train.heads.classes import ClassesHead, ImageClassHead
 from tangent_train.heads.distance import DistanceHead
@@ -25,9 +28,15 @@ def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:
     Args:
         loaded: `LoadedNetwork`.
         **settings: Settings of the head, see `Head.predict_settings`.
+
+    Raises:
+        SettingError: A setting is not one of that head, or invalid.
     """
-    if loaded.depth_kind is not None:
-        return DistanceHead(depth_kind=loaded.depth_kind, **settings)
-    head = ClassesHead(loaded.class_names, **settings)
+    try:
+        if loaded.depth_kind is not None:
+            return DistanceHead(depth_kind=loaded.depth_kind, **settings)
+        head = ClassesHead(loaded.class_names, **settings)
+    except ValidationError as error:
+        raise wrong_setting(error, {}) from error
     head.num_outputs = loaded.network.num_outputs  # with that of no class
     return head

@@ -19,11 +19,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps
@@ -35,6 +36,7 @@ from datamodules.core.label_map import (
     read_label_map,
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
+from tangent_train.config.build import checks_types
 from tangent_train.errors import SettingError, check_choice, check_type, width_height
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
@@ -64,15 +66,30 @@ Unmapped = Literal["unknown", "never"]
 Depth = Tensor | NDArray[Any] | None
 """``(H, W)`` floats in meters, 0 or NaN where missing."""
 
+_Stored = str | Path | Image.Image | NDArray[Any]
+"""Pictures whose results are arrays."""
+
 _SHOWN = 6
 
 
+class ImageSettings(TypedDict, total=False):
+    """Arguments of the methods of `Network` besides the image, see `Network.labels`."""
+
+    depth: Depth
+    fov: float | None
+    area: Sequence[float] | None
+    upright: Upright
+    max_tilt_deg: float
+    mask: Mask | str | NDArray[Any] | Tensor
+
+
+@checks_types
 def load(
     path: str | Path,
     *,
     label_map: str | Path | None = None,
     unmapped: Unmapped = "unknown",
-    device: str = "cpu",
+    device: str | int | torch.device = "cpu",
     levels: Levels = None,
     base_level: int | None = None,
     blend: Blend = "feather",
@@ -168,6 +185,12 @@ class Network:
             f"on {self._predictor.device}>"
         )
 
+    @overload
+    def labels(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
+    @overload
+    def labels(
+        self, image: _Stored, **settings: Unpack[ImageSettings]
+    ) -> NDArray[np.unsignedinteger]: ...
     def labels(
         self,
         image: Picture,
@@ -178,7 +201,7 @@ class Network:
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
-    ) -> Any:
+    ) -> NDArray[Any] | Tensor:
         """Return the label of every pixel.
 
         Args:
@@ -208,6 +231,10 @@ class Network:
         found = self._predictor.predict(given).pixels().cpu().numpy()
         return _as_given(_masked(found, given, image, mask, 0), image)
 
+    @overload
+    def depth(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
+    @overload
+    def depth(self, image: _Stored, **settings: Unpack[ImageSettings]) -> NDArray[np.float32]: ...
     def depth(
         self,
         image: Picture,
@@ -216,7 +243,7 @@ class Network:
         area: Sequence[float] | None = None,
         upright: Upright = None,
         mask: Mask | str | NDArray[Any] | Tensor = None,
-    ) -> Any:
+    ) -> NDArray[Any] | Tensor:
         """Return the depth of every pixel: distance from the center, or z-depth in photos.
 
         Args:
@@ -240,7 +267,13 @@ class Network:
         found = self._predictor.predict(given).pixels().cpu().numpy()
         return _as_given(_masked(found, given, image, mask, np.nan), image)
 
-    def probabilities(self, image: Picture, **settings: Any) -> Any:
+    @overload
+    def probabilities(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
+    @overload
+    def probabilities(
+        self, image: _Stored, **settings: Unpack[ImageSettings]
+    ) -> NDArray[np.float32]: ...
+    def probabilities(self, image: Picture, **settings: Any) -> NDArray[Any] | Tensor:
         """Return the probability of every class at every pixel.
 
         Args:
@@ -307,7 +340,7 @@ def _masked(
     return given.cut(np.where(is_shown, result, result.dtype.type(unknown)))
 
 
-def _as_given(result: NDArray[Any], image: Any) -> Any:
+def _as_given(result: NDArray[Any], image: Any) -> NDArray[Any] | Tensor:
     """Return a result ``(H, W[, K])``; for tensors, on their device and channels first."""
     if not isinstance(image, Tensor):
         return result

@@ -141,7 +141,7 @@ def _of_encoder(config: dict[str, Any]) -> Normalization:
 
 def _load_used(network: Any, tensors: dict[str, Any], source: object) -> None:
     used = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}
-    load_tensors(network, used)
+    load_tensors(network, used, source)
 
 
 def load_onnx(
@@ -191,7 +191,7 @@ def load_config(
     names, normalization = class_names_in(classes, depth), Normalization.of(normalization, 3)
     settings = completed_settings(network, 3, len(names) or 1, restored=True)
     module = build_from_config(settings, "network")
-    load_tensors(module, tensors_for(module, Path(weights)))
+    load_tensors(module, tensors_for(module, Path(weights)), weights)
     kinds: Any = {"score_kind": None if depth else "logits", "depth_kind": depth}
     return PhotoNetwork(module, settings, names, normalization, **kinds)
 
