@@ -13,6 +13,7 @@ import pytest
 
 import tangent_train
 from tangent_train.errors import SettingError
+from tangent_train.geometry.sphere import check_area
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tests.running import run_python
 
@@ -107,13 +108,14 @@ def test_modules_of_our_names_that_come_first_are_named(tmp_path: Path) -> None:
     assert "models.py has the name of a package of tangent-train: rename it" in done.stderr
 
 
+UNTYPED: Any = tangent_train
 GRID = tangent_train.TangentGrid(0, 3)
 PANORAMA = np.zeros((16, 32), np.uint8)
 
 
 @pytest.mark.parametrize("wrong", [[[0, 1]], "room.jpg", 5, None], ids=str)
 def test_arguments_of_other_types_are_named(wrong: Any) -> None:
-    size, tt = (16, 32), tangent_train
+    size, tt = (16, 32), UNTYPED
     for name, call in {
         "panorama": lambda: tt.equirect_to_tangent(wrong, GRID),
         "grid": lambda: tt.equirect_to_tangent(PANORAMA, wrong),
@@ -127,6 +129,23 @@ def test_arguments_of_other_types_are_named(wrong: Any) -> None:
 
 
 @pytest.mark.parametrize(
+    "given",
+    [{"views": 5}, {"levels": "x"}, {"rotations": "x"}, {"device": 5.5}, {"base_level": [0]}],
+    ids=str,
+)
+def test_settings_of_other_types_are_named(given: dict[str, Any]) -> None:
+    (name,) = given
+    with pytest.raises(SettingError, match=rf"^{name}: found .*; expected a valid "):
+        UNTYPED.load("missing.ckpt", **given)
+
+
+@pytest.mark.parametrize("area", [5, "abcd", [0, 90], [0, "a", 0, 90]], ids=str)
+def test_an_area_of_another_type_is_named(area: Any) -> None:
+    with pytest.raises(SettingError, match=r"^area: found \["):
+        check_area(area)
+
+
+@pytest.mark.parametrize(
     ("build", "message"),
     [
         (
@@ -135,8 +154,8 @@ def test_arguments_of_other_types_are_named(wrong: Any) -> None:
         ),
         (lambda: tangent_train.TangentGrid(9, 12), "base_level: found 9; .* from 0 to 8"),
         (lambda: tangent_train.TangentGrid(-1, 4), "base_level: found -1; "),
-        (lambda: tangent_train.TangentGrid(0, 4.5), "level: found 4.5; expected an integer"),
-        (lambda: tangent_train.TangentGrid(0, 4, "16"), "dim: found '16'; expected an integer"),
+        (lambda: UNTYPED.TangentGrid(0, 4.5), "level: found 4.5; expected an integer"),
+        (lambda: UNTYPED.TangentGrid(0, 4, "16"), "dim: found '16'; expected an integer"),
         (lambda: tangent_train.TangentGrid(0, 4, rotation=5), "rotation: found 5.0; "),
         (lambda: tangent_train.equirect_to_tangent(PANORAMA, GRID, [20]), "faces: .*, 0 to 19"),
         (lambda: TangentRepresentation(0, 15), "level: found 15; .* from 0 to 14"),

@@ -242,7 +242,10 @@ def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         rows = settings.height
         shape = cameras.shape if rows is None else (rows, 2 * rows)
         path = path.with_name(path.name + results.suffix) if adds_suffix else path
-        results.write(path, shape, settings.blend, z_depth=settings.z_depth)
+        lost = results.write(path, shape, settings.blend, z_depth=settings.z_depth)
+        if lost:
+            reason = "distances beyond its integers are unknown (0); give depth as floats"
+            print_text(f"{path}: {counted(lost, 'pixels')}: {reason}", error=True)
 
     single = root if root.is_file() else root / CAMERAS_FILE
     if single.is_file():

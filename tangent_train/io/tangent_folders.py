@@ -211,7 +211,7 @@ class TangentResults:
             return ".npy"
         return ".tif" if self.arrays[0].dtype.kind == "f" else ".png"
 
-    def write(self, path: Path, shape: tuple[int, int], blend: Blend, *, z_depth: bool) -> None:
+    def write(self, path: Path, shape: tuple[int, int], blend: Blend, *, z_depth: bool) -> int:
         """Render the results back to a panorama, and write it.
 
         Results of another size than the images cover the same field of view, edge to edge.
@@ -223,6 +223,9 @@ class TangentResults:
             blend: Blending of overlapping images, for colors and features.
             z_depth: True to convert z-depth of the images to distance from the center. In integers
                 that cannot hold a distance, it is missing: 0.
+
+        Returns:
+            Number of pixels of the images whose distance the integers cannot hold.
 
         Raises:
             SettingError: The format cannot hold the pixels, or `z_depth` is set without depth.
@@ -244,6 +247,8 @@ class TangentResults:
             panorama = np.empty(whole, arrays[0].dtype)
             self._render(arrays, blend, panorama)
             pixel_files.write_pixels(path, panorama.astype(dtype, copy=False))
+        pairs = zip(self.arrays, arrays, strict=True) if z_depth else ()
+        return sum(int(((after == 0) & (before % _NO_DEPTH != 0)).sum()) for before, after in pairs)
 
     def _image_dtype(self) -> np.dtype[Any]:
         dtype = self.arrays[0].dtype

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -61,6 +62,9 @@ _SIDE = 32
 _NOT_OF_COLORS = ("do_resize", "do_center_crop", "do_pad", "do_split_image")
 """Settings of an image processor that move pixels; they are switched off in the test."""
 
+_MOST_PIXELS = 2**26
+"""Largest image size of an image processor that is tried."""
+
 _LISTED = 4
 """Largest number of wrong tensors in a message."""
 
@@ -114,7 +118,7 @@ def load(
         settings=settings,
         score_names=names if classes is None else class_names_in(classes),
         normalization=given or Normalization(processor["mean"], processor["std"]),
-        image_size=_image_size(processor),
+        image_size=_image_size(processor, folder / "preprocessor_config.json"),
         score_kind="logits",
         depth_kind=kind,
     )
@@ -217,15 +221,19 @@ def _processor_class(content: Mapping[str, Any], model_type: str) -> Any:
     return kind
 
 
-def _image_size(processor: Mapping[str, Any]) -> tuple[int, int]:
-    """Return rows and columns of the images after the image processor."""
+def _image_size(processor: Mapping[str, Any], path: Path) -> tuple[int, int]:
+    """Return rows and columns of the images after the image processor of a file."""
     given = processor.get("size") if processor.get("do_resize") else None
     if processor.get("do_center_crop") and processor.get("crop_size"):
         given = processor["crop_size"]
     if given is None:
         return USUAL_SIZE
     side = given.get("shortest_edge", given.get("longest_edge"))
-    return int(given.get("height", side)), int(given.get("width", side))
+    size = given.get("height", side), given.get("width", side)
+    if not all(isinstance(n, int) and n > 0 for n in size) or math.prod(size) > _MOST_PIXELS:
+        expected = f"rows and columns of at most {_MOST_PIXELS} pixels"
+        raise DataError(path, found=f"an image size of {size[0]} × {size[1]}", expected=expected)
+    return size
 
 
 def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:

@@ -18,7 +18,8 @@ from tangent_train.checkpoints.loaded import (
     load_network,
 )
 from tangent_train.checkpoints.outputs import plain_output
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
+from tangent_train.tasks import PixelTask
 from tests.tasks.small_networks import save_checkpoint
 
 SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]
@@ -55,6 +56,11 @@ def test_a_network_computes_what_its_task_does(
     assert trained.level == (5 if "level=5" in overrides else 4)
     assert trained.normalization.channels == 2 + len(trained.inputs)
     assert trained.representation["_target_"].startswith("tangent_train.rendering.")
+
+
+def test_lightnings_loading_without_arguments_names_ours() -> None:
+    with pytest.raises(SettingError, match=r"^PixelTask\.load_from_checkpoint: .*tt\.load"):
+        PixelTask.load_from_checkpoint("best.ckpt")
 
 
 class Upsampled(nn.Sequential):

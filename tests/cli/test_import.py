@@ -73,6 +73,34 @@ def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys:
     assert set(np.unique(expected)) == ({0, 1, 2, 3} if wins else {1, 2, 3})
 
 
+def test_weights_beside_an_onnx_file_are_written_into_it(here: Path, run: Run) -> None:
+    """The default of `torch.onnx.export`: larger tensors are in ``net.onnx.data``."""
+    network = torch.nn.Sequential(torch.nn.Conv2d(3, 64, 3, padding=1), torch.nn.Conv2d(64, 4, 1))
+    images = torch.rand(1, 3, 32, 32)
+    torch.onnx.export(network.eval(), (images,), here / "net.onnx", dynamo=True, verbose=False)
+    assert (here / "net.onnx.data").stat().st_size > 3 * 64 * 9 * 4
+    run("import", *OF_ONNX, "output=ours.onnx")
+    (here / "net.onnx.data").unlink()
+    with torch.no_grad():
+        expected = network(images)
+    torch.testing.assert_close(load_network(here / "ours.onnx").network(images), expected)
+    with pytest.raises(SystemExit, match=r"net\.onnx\.data.*; expected an ONNX file"):
+        run("import", *OF_ONNX, "output=other.onnx")
+
+
+def test_an_import_without_a_trained_network_is_explained(here: Path, run: Run) -> None:
+    del here
+    with pytest.raises(SystemExit, match=r"weights: .* a trained network.*hexunet.*tangent-train"):
+        run("import", "network=unet", "network.widths=[4,8]")
+
+
+def test_weights_of_another_network_are_one_line(here: Path, run: Run) -> None:
+    torch.save(UNet(3, 4, (4, 8)).state_dict(), here / "state.pt")
+    given = ("weights=state.pt", "classes=classes.json", "normalization=unit", "output=net.ckpt")
+    with pytest.raises(SystemExit, match=r"^tangent-import: state\.pt: found .*tensors of UNet.*$"):
+        run("import", "network=unet", "network.widths=[4,8,16]", *given)
+
+
 @pytest.mark.parametrize("size", [(48, 96), (96, 48), (32, 64), (20, 50)])
 def test_a_file_for_images_that_are_not_square(
     size: tuple[int, int], here: Path, run: Run, capsys: Capture

@@ -17,7 +17,7 @@ from tangent_train.io.camera_files import read_cameras, read_rig
 from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tangent_train.rendering import equirect_to_tangent, tangent_to_equirect
 from tests.cli.rendering import Refused, render_with, smooth
-from tests.running import Patch
+from tests.running import Capture, Patch
 
 _read = partial(read_pixels, indices=True)
 
@@ -139,6 +139,25 @@ def test_z_depth_of_floats_becomes_distance(rendered: Path, tmp_path: Path, dim:
     plain = _read(tmp_path / "plain.tif")
     assert plain[measured].min() < 2.1
     assert set(np.unique(plain)) <= set(np.unique(depth))
+
+
+def test_distances_beyond_the_integers_are_unknown_and_counted(
+    rendered: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    grid = TangentGrid(0, 5)
+    line = (np.arange(grid.dim) - (grid.dim - 1) / 2) * grid.pitch
+    x, y = np.meshgrid(line, line)
+    depth = np.full((grid.dim, grid.dim), 60000, np.uint16)
+    for face in range(20):
+        write_pixels(tmp_path / "depth" / f"face_{face:03}.png", depth)
+    output = tmp_path / "back.png"
+    cameras = rendered / "cameras.json"
+    render_with(back=tmp_path / "depth", cameras=cameras, output=output, z_depth=True)
+    count = 20 * int((60000 * np.sqrt(x**2 + y**2 + 1) > 65535).sum())
+    assert count > 0
+    assert f"{count} pixels: distances beyond its integers are unknown" in capsys.readouterr().err
+    distance = _read(output)
+    assert distance[distance > 0].min() >= 60000
 
 
 @pytest.mark.parametrize(("dim", "blend"), [(32, "nearest"), (16, "feather")])

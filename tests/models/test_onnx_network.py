@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -71,6 +72,31 @@ def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(SettingError, match=r"onnxruntime.*pip install -e '\.\[export\]'"):
         OnnxNetwork(whole)
+
+
+@pytest.mark.parametrize(
+    ("location", "found"),
+    [
+        ("../out.data", "escapes model directory"),
+        ("link.data", "escapes model directory"),
+        ("{folder}/out.data", "Absolute path"),
+        ("missing.data", "missing.data"),
+    ],
+)
+def test_weights_outside_the_folder_are_refused(tmp_path: Path, location: str, found: str) -> None:
+    folder = tmp_path / "net"
+    folder.mkdir()
+    graph = onnx.load(_linear(tmp_path / "whole.onnx"))
+    data = {"location": "out.data", "size_threshold": 0}
+    onnx.save(graph, tmp_path / "out.onnx", save_as_external_data=True, **data)
+    (folder / "link.data").symlink_to(tmp_path / "out.data")
+    graph = onnx.load(tmp_path / "out.onnx", load_external_data=False)
+    for entry in (e for t in graph.graph.initializer for e in t.external_data):
+        if entry.key == "location":
+            entry.value = location.format(folder=tmp_path)
+    (folder / "net.onnx").write_bytes(graph.SerializeToString())
+    with pytest.raises(DataError, match=rf"net\.onnx: .*{found}.*; expected .* in its folder\.$"):
+        OnnxNetwork(folder / "net.onnx")
 
 
 IDENTITY = helper.make_node("Identity", ["images"], ["scores"])

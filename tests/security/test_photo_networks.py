@@ -41,6 +41,15 @@ def test_an_image_processor_runs_and_fetches_nothing(folder: Path, tmp_path: Pat
     assert happened == []
 
 
+@pytest.mark.parametrize(
+    "size", [{"height": 10**9, "width": 1}, {"height": 31623, "width": 31623}, 10**9], ids=str
+)
+def test_an_image_processor_of_huge_images_is_refused(folder: Path, size: Any) -> None:
+    networks.change_json(folder / "preprocessor_config.json", size=size)
+    with pytest.raises(DataError, match=r"preprocessor_config\.json: found an image size of 1?3?"):
+        networks.imported(folder)
+
+
 def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:
     """Return a copy with additional keys in a section."""
     if not place:
