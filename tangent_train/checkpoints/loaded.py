@@ -25,7 +25,7 @@ from tangent_train.checkpoints.outputs import OutputNetwork
 from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
-from tangent_train.files import load_plain
+from tangent_train.files import checked_file, load_plain
 from tangent_train.io.gpano import Fill
 from tangent_train.kinds import DepthKind, ScoreKind
 
@@ -237,6 +237,10 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
         DataError: The file is missing, has other content, names classes that are not allowed, or
             its network cannot be built; or a package to read it is missing.
     """
+    try:
+        checked_file(path)
+    except OSError as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
     onnx = OnnxNetwork(path) if path.suffix.lower() == ".onnx" else None
     if onnx is None:
         described = read_description(path)
