@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tangent_train.inference.api import apply, load
     from tangent_train.rendering import (
         equirect_to_tangent,
+        perspective,
         tangent_to_equirect,
         tangent_to_labels,
     )
@@ -27,6 +28,7 @@ __all__ = [
     "apply",
     "equirect_to_tangent",
     "load",
+    "perspective",
     "tangent_to_equirect",
     "tangent_to_labels",
 ]

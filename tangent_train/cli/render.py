@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from datamodules.folder.class_masks import class_masks
 from tangent_train.cli import main
@@ -17,8 +17,15 @@ from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import check_new
-from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
-from tangent_train.inference.views import view_settings
+from tangent_train.geometry import (
+    PinholeGrid,
+    TangentGrid,
+    nearest_level,
+    perspective_grid,
+    view_rotation,
+)
+from tangent_train.geometry.camera import half_width
+from tangent_train.inference.views import HORIZONTAL, view_settings
 from tangent_train.io.camera_files import (
     CAMERAS_FILE,
     RIG_FILE,
@@ -44,6 +51,7 @@ from tangent_train.io.tangent_folders import (
 from tangent_train.keypoints.colmap import panorama_poses
 from tangent_train.manifest import Manifest
 from tangent_train.rendering.figure import tangent_figure
+from tangent_train.rendering.representations.pinhole import ring_size
 
 
 def render(settings: RenderSettings) -> None:
@@ -74,41 +82,40 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     if kind == "nearest" and suffix in LOSSY_SUFFIXES:
         expected = "png, tif or npy with interpolation=nearest: other formats change pixels"
         raise SettingError("format", found=settings.format, expected=expected)
-    grid, faces, level = _views(settings, 512)  # refuses views before any panorama
+    cameras = _cameras(settings, 512)  # refuses views before any panorama
     names, masks = inputs.names, Masks(None)
     if settings.colmap:  # a camera has images of one size
-        grid, faces, level = _views(settings, _most_rows(settings, inputs))
+        rows = _most_rows(settings, inputs)
+        cameras = _cameras(settings, rows)
         masks = Masks(settings.mask)
         if settings.mask_classes:
             masks = class_masks(Path(str(settings.mask)), settings.mask_classes)
-        content = {**content, "level": level}
-    prefixes = {f"{face_name(grid, face)}/": face for face in faces}
+        content = {**content, "level": _level(settings, rows)}
+    rig = {f"{Path(file).stem}/": cameras.views[face] for file, face in cameras.items}
     manifest = Manifest.open(output, content)
 
     def work(job: Job, progress: Callable[[float], object]) -> None:
         image, area = read_placed(job.path, kind, settings.area, job.value, settings.depth_channel)
         shape = image.shape[0], image.shape[1]
-        view = (grid, faces, level) if settings.colmap else _views(settings, shape[0])
         if settings.colmap:
             end = f"{flat_name(job.name)}{suffix}"
-            images = {output / "images" / (p + end): face for p, face in prefixes.items()}
-            write_views(image, grid, images, kind, progress)
+            images = {output / "images" / (prefix + end): view for prefix, view in rig.items()}
+            write_views(image, images, kind, progress)
             counts = masks.read(job.name, area)
-            of_images = {output / "masks" / f"{p}{end}.png": face for p, face in prefixes.items()}
-            write_views(counts, grid, of_images, "nearest", lambda _: None)
+            of_images = {output / "masks" / f"{p}{end}.png": view for p, view in rig.items()}
+            write_views(counts, of_images, "nearest", lambda _: None)
             return
-        files = tuple(f"{face_name(view[0], face)}{suffix}" for face in view[1])
-        cameras = CameraFile(job.path.name, shape, view[0], view[1], files)
-        folder = output / job.name
-        paths = {folder / file: face for file, face in zip(files, view[1], strict=True)}
-        write_views(image, view[0], paths, kind, progress)
-        write_cameras(folder / CAMERAS_FILE, cameras)
+        of_panorama = replace(_cameras(settings, shape[0]), source=job.path.name, shape=shape)
+        folder, views = output / job.name, of_panorama.views
+        paths = {folder / file: views[face] for file, face in of_panorama.items}
+        write_views(image, paths, kind, progress)
+        write_cameras(folder / CAMERAS_FILE, of_panorama)
 
     failed = _render_missing(manifest, names, inputs.jobs, work)
     if settings.colmap:
         done = {name: manifest.finished[name] for name in names if name in manifest.finished}
         panoramas = {f"{flat_name(name)}{suffix}": item["file"] for name, item in done.items()}
-        write_rig(output / RIG_FILE, grid, prefixes, panoramas)
+        write_rig(output / RIG_FILE, rig, panoramas)
     _print_written(output, names, failed)
 
 
@@ -143,30 +150,62 @@ def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
     job = next(iter(inputs.jobs(inputs.names)))
     kind, channel = settings.interpolation, settings.depth_channel
     image, _ = read_placed(job.path, kind, settings.area, job.value, channel)
-    grid = _views(settings, image.shape[0])[0]
+    grid = _cameras(settings, image.shape[0]).grid
     if not isinstance(grid, TangentGrid):
         raise SettingError("figure", found=path, expected=f"null, for views={settings.views}")
     write_pixels(path, tangent_figure(image, grid))
     print_text(f"Written: {path}")
 
 
-def _views(settings: RenderSettings, rows: int) -> tuple[PinholeGrid, tuple[int, ...], int]:
-    """Return the grid for a number of rows, the indices of the images to write, and the level."""
-    level = nearest_level(rows) if settings.level is None else settings.level
-    section = view_settings(settings.views or {"option": "tangent", "base_level": 1})
-    given = {"base_level": settings.base_level, "dim": settings.dim, "level": level}
-    section |= {name: value for name, value in given.items() if value is not None}
-    # Labels are rendered back from the owner of each direction.
-    section |= {"blend": "nearest"} if "blend" in section else {}
-    grid: PinholeGrid | None = getattr(build_from_config(section, "views"), "grid", None)
-    if grid is None:
-        raise SettingError("views", found=settings.views, expected="tangent, horizontal or cubemap")
+def _cameras(settings: RenderSettings, rows: int) -> CameraFile:
+    """Return the images to write of a panorama with some rows; source and shape are not set."""
+    grids = _grids(settings, _level(settings, rows))
     if settings.rotation is not None:  # x forward, y to the right, z up
-        yaw, pitch, roll = np.radians(settings.rotation)
-        # A positive rotation about y looks down.
-        tilt = rotation_about((0, 1, 0), -pitch) @ rotation_about((1, 0, 0), -roll)
-        grid = grid.with_rotation(rotation_about((0, 0, 1), yaw) @ tilt)
-    return grid, tuple(int(face) for face in grid.face_indices(settings.faces)), level
+        rotation = view_rotation(*settings.rotation)
+        grids = [grid.with_rotation(rotation) for grid in grids]
+    count = sum(grid.num_images for grid in grids)
+    faces = range(count) if settings.faces is None else settings.faces
+    try:
+        indices = tuple(range(count)[face] for face in faces)
+    except IndexError as error:
+        expected = f"indices of the {count} images, from 0"
+        raise SettingError("faces", found=list(faces), expected=expected) from error
+    files = tuple(f"{face_name(face, count)}.{settings.format}" for face in indices)
+    return CameraFile("", (0, 0), grids[0], indices, files, tuple(grids[1:]))
+
+
+def _level(settings: RenderSettings, rows: int) -> int:
+    return nearest_level(rows) if settings.level is None else settings.level
+
+
+def _grids(settings: RenderSettings, level: int) -> Sequence[PinholeGrid]:
+    """Return the images, which need not cover the sphere; one grid for each field of view."""
+    given = {name: getattr(settings, name) for name in _DIRECTIONS}
+    others = {"base_level": settings.base_level, "dim": settings.dim}
+    if any(value is not None for value in given.values()):
+        for name, value in {"views": settings.views, **others}.items():
+            if value is not None:
+                expected = "null beside yaw, pitch, roll, fov or size"
+                raise SettingError(name, found=value, expected=expected)
+        fov = 90.0 if settings.fov is None else settings.fov
+        pair = fov if isinstance(fov, tuple) else (fov, fov)
+        columns = ring_size(level, pair)[1]
+        rows = math.ceil(columns * half_width(pair[1]) / half_width(pair[0]) - 1e-9)
+        size = settings.size or (columns, rows)
+        angles = (getattr(settings, name) or 0.0 for name in _DIRECTIONS[:3])
+        yaw, pitch, roll = angles
+        grids: Sequence[PinholeGrid] = [perspective_grid(yaw, pitch, fov, size, roll)]
+    else:
+        section = view_settings(settings.views or {"option": "tangent", "base_level": 1})
+        known = {name: value for name, value in others.items() if value is not None}
+        section |= {"level": level, **known}
+        if section["_target_"] == HORIZONTAL:
+            section["_target_"] = _SEPARATE
+        grids = getattr(build_from_config(section, "views"), "grids", ())
+        if not grids:
+            expected = "tangent, cubemap or an option that begins with horizontal"
+            raise SettingError("views", found=settings.views, expected=expected)
+    return grids
 
 
 def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
@@ -228,16 +267,22 @@ def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     _print_written(output, [*folders], failed)
 
 
+_DIRECTIONS = ("yaw", "pitch", "roll", "fov", "size")
+"""Settings of views in given directions."""
+
 _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set[str]]] = {
     "input": (
         _render_views,
         {"every", "area", "views", "base_level", "level", "dim", "faces", "rotation", "format"}
+        | {*_DIRECTIONS}
         | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"},
     ),
     "back": (_render_back, {"cameras", "blend", "height", "kind", "depth_channel", "z_depth"}),
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
+
+_SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
 
 if __name__ == "__main__":
     main.render()

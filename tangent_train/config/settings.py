@@ -176,8 +176,8 @@ class RenderSettings(ImageSettings):
     overwrite: bool = False
     """true: replace an existing file (of figure=, poses=, or back= of one panorama)"""
     views: Views = None
-    """views: tangent | horizontal | horizontal_economy | cubemap, or 'views={option: horizontal,
-    fov: 110}'; null = tangent"""
+    """views: tangent | horizontal | horizontal_economy | horizontal_wide | cubemap, or
+    'views={option: horizontal, fov: 110}'; null = tangent"""
     base_level: int | None = None
     """base level b: 20·4^b tangent images; null = 1"""
     level: Level | None = None
@@ -185,6 +185,17 @@ class RenderSettings(ImageSettings):
     dim: int | None = None
     """tangent images: side in pixels; smaller crops them, larger adds a margin; null = 2^(s−b).
     Other views: see views"""
+    yaw: OneOrMore[float] | None = None
+    """views in these directions instead of tangent images: degrees to the right of the middle, e.g.
+    [0,90,180,270]; null = 0"""
+    pitch: OneOrMore[float] | None = None
+    """degrees above the horizon, one or as many as yaw; null = 0"""
+    roll: OneOrMore[float] | None = None
+    """degrees by which the view is rolled clockwise, one or as many as yaw; null = 0"""
+    fov: FieldOfView | tuple[FieldOfView, FieldOfView] | None = None
+    """horizontal field of view of these views in degrees, or [horizontal, vertical]; null = 90"""
+    size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = None
+    """size of these views in pixels: [width, height], or one number; null = by level and fov"""
     faces: OneOrMore[int] | None = None
     """indices of the images to write, e.g. [0,5]; null = all"""
     rotation: tuple[float, float, float] | None = None

@@ -26,6 +26,9 @@ from tangent_train.geometry.grids import RingGrid as RingGrid
 from tangent_train.geometry.grids import TangentGrid as TangentGrid
 from tangent_train.geometry.icosphere import icosphere as icosphere
 from tangent_train.geometry.icosphere import vertex_resolution as vertex_resolution
+from tangent_train.geometry.perspective import Angles as Angles
+from tangent_train.geometry.perspective import perspective_grid as perspective_grid
+from tangent_train.geometry.perspective import view_rotation as view_rotation
 from tangent_train.geometry.sphere import MOST_ROWS as MOST_ROWS
 from tangent_train.geometry.sphere import PanoramaPose as PanoramaPose
 from tangent_train.geometry.sphere import checked_rotation as checked_rotation

@@ -37,6 +37,7 @@ def check_coverage(
     valid: NDArray[np.bool_] | None = None,
     *,
     by_owners: bool = False,
+    remedy: str = "Use a larger fov or more views, or limit the views to an area.",
 ) -> None:
     """Refuse images that together do not cover the sphere, or the valid pixels of a panorama.
 
@@ -45,6 +46,7 @@ def check_coverage(
         valid: ``(H, W)`` pixels to cover; None for the sphere.
         by_owners: True if every direction must be shown by its owner, as the blend ``nearest``
             needs, of one grid; False if any image may show it.
+        remedy: Remedy in the message.
 
     Raises:
         SettingError: A direction is more than half a pixel outside the outermost pixel centers.
@@ -58,7 +60,7 @@ def check_coverage(
             "views",
             found=f"{count} views that miss longitude {longitude:.0f}°, latitude {latitude:.0f}°",
             expected=f"views that cover {'the sphere' if valid is None else 'the area'}{owners}",
-            remedy="Use a larger fov or more views, or limit the views to an area.",
+            remedy=remedy,
         )
 
 

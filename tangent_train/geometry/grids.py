@@ -40,6 +40,8 @@ class PinholeGrid:
         pitch: Distance p of neighboring pixels on the image plane, in focal lengths.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         is_overlapping: True if every direction is inside an image, not only on its outer edge.
+        is_complete: True if the images are known to cover what they are rendered back to; False to
+            check it then.
 
     Raises:
         SettingError: The rotation is not a rotation, or the size is out of range.
@@ -53,6 +55,7 @@ class PinholeGrid:
         rotation: ArrayLike | None = None,
         *,
         is_overlapping: bool = True,
+        is_complete: bool = False,
     ) -> None:
         self._axes = axes
         self.size = (
@@ -62,6 +65,7 @@ class PinholeGrid:
         self.pitch = pitch
         self.rotation = None if rotation is None else checked_rotation(rotation)
         self.is_overlapping = is_overlapping
+        self.is_complete = is_complete
 
     @property
     def num_images(self) -> int:
@@ -300,7 +304,8 @@ class TangentGrid(PinholeGrid):
                 expected=f"at least {least} at base level {base_level} and level {level}",
                 remedy="Smaller images would leave parts of the sphere uncovered.",
             )
-        super().__init__(_face_axes(base_level), (dim, dim), _pitch(base_level, level), rotation)
+        axes, pitch = _face_axes(base_level), _pitch(base_level, level)
+        super().__init__(axes, (dim, dim), pitch, rotation, is_complete=True)
         self.base_level = base_level
         self.level = level
 
@@ -374,7 +379,8 @@ class CubeGrid(PinholeGrid):
         axes = _upright_axes([x, y, -x, -y, z, -z])
         pitch = 2 / (dim - 2 * margin)
         # Without a margin, neighbors meet at their outer edges.
-        super().__init__(axes, (dim, dim), pitch, rotation, is_overlapping=margin > 0)
+        kinds = {"is_overlapping": margin > 0, "is_complete": True}
+        super().__init__(axes, (dim, dim), pitch, rotation, **kinds)
 
 
 class RingGrid(PinholeGrid):
@@ -392,7 +398,7 @@ class RingGrid(PinholeGrid):
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         valid: ``(H, W)`` pixels of a panorama that the images must cover; None for the sphere.
         by_owners: False if images may be blended with ``feather`` only, see `check_coverage`.
-        is_complete: False for images that cover them together with those of other grids.
+        is_complete: False for images that do not cover them, or only with those of other grids.
 
     Raises:
         SettingError: A field of view is out of range, or the images miss a direction.
@@ -422,7 +428,7 @@ class RingGrid(PinholeGrid):
             for number in range(int(ring["views"]))
         ]
         axes = _upright_axes(lonlat_to_xyz(np.radians(centers_deg)))
-        super().__init__(axes, (size[0], size[1]), pitch, rotation)
+        super().__init__(axes, (size[0], size[1]), pitch, rotation, is_complete=is_complete)
         resting = self.with_rotation(None)
         if is_complete:
             check_coverage([resting], valid, by_owners=by_owners)

@@ -87,7 +87,7 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def checked_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
-    """Return a read-only copy of a rotation matrix.
+    """Return a copy of a rotation matrix.
 
     Args:
         rotation: ``(3, 3)`` matrix.
@@ -107,7 +107,6 @@ def checked_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
         raise SettingError(
             "rotation", found=matrix.tolist(), expected="a 3×3 rotation matrix of determinant +1"
         )
-    matrix.setflags(write=False)
     return matrix
 
 

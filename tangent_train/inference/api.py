@@ -53,8 +53,8 @@ from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
-from tangent_train.rendering.forward import blend_of, check_grid, check_panorama
-from tangent_train.rendering.mosaic import MeanMosaic
+from tangent_train.rendering.forward import check_grid, check_panorama
+from tangent_train.rendering.mosaic import MeanMosaic, blend_back
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.resampling import Pixels, reduce_to_pitch
 
@@ -367,7 +367,7 @@ def apply(
     """
     check_type("function", function, Callable, "a function of images")  # type: ignore[arg-type]
     check_grid(grid)
-    blend = blend_of(blend, is_overlapping=grid.is_overlapping)
+    blend = blend_back(grid, blend)
     check_panorama(panorama, "bilinear")
     step = images_per_call or views_per_forward(grid.size)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]

@@ -42,6 +42,7 @@ name as ``option``, with changed settings of the representation. None as trained
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
+HORIZONTAL = "tangent_train.rendering.HorizontalRepresentation"
 _EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
 _ICOSPHERE = "tangent_train.rendering.IcosphereRepresentation"
 

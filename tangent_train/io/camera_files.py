@@ -26,12 +26,16 @@ from tangent_train.geometry import (
     checked_rotation,
     to_right_handed,
 )
+from tangent_train.geometry.coverage import overlaps
 
 CAMERAS_FILE = "cameras.json"
 """Name of the file in a folder of tangent images."""
 
 RIG_FILE = "rig_config.json"
 """Name of the file in a COLMAP project."""
+
+View = tuple[PinholeGrid, int]
+"""An image of a grid, by its index."""
 
 _MOST_PIXELS = 2**20  # limit for rows and columns: a panorama of the size in the file is allocated
 _CONVENTIONS = {
@@ -47,6 +51,7 @@ _CONVENTIONS = {
     "is not rotated.",
     "views": "world_from_camera of all views. Tangent images are determined by base_level, level, "
     "dim and icosahedron_rotation.",
+    "camera": "The camera of all images; null if the images have cameras of their own.",
     "fov_deg": "Angle across the middle of an image, from edge to edge.",
 }
 _POSES = {
@@ -95,7 +100,7 @@ class _CamerasJson(BaseModel):
 
     format: Literal["tangent images"]
     source: _Source
-    camera: _Camera
+    camera: _Camera | None
     images: list[_Image]
     base_level: int | None = None
     level: int = 0
@@ -114,6 +119,8 @@ class _CamerasJson(BaseModel):
             rotation: Any = self.icosahedron_rotation
             in_world = None if rotation is None else _in_world(rotation)
             return TangentGrid(self.base_level, self.level, self.dim, in_world)
+        if self.camera is None:
+            raise ValueError("views of several fields of view, which cannot be rendered back")
         axes = np.stack([to_right_handed(np.transpose(view)).T for view in self.views])
         size, focal = (self.camera.height, self.camera.width), self.camera.matrix[0][0]
         return PinholeGrid(axes, size, 1 / focal, is_overlapping=self.overlapping)
@@ -129,6 +136,7 @@ class CameraFile:
         grid: Geometry of all images.
         faces: Indices of the images that have a file.
         files: File name of each face.
+        others: Images of other fields of view, whose indices follow those of the grid.
     """
 
     source: str
@@ -136,6 +144,18 @@ class CameraFile:
     grid: PinholeGrid
     faces: tuple[int, ...]
     files: tuple[str, ...]
+    others: tuple[PinholeGrid, ...] = ()
+
+    @property
+    def items(self) -> list[tuple[str, int]]:
+        """File name and index of the images that have a file."""
+        return list(zip(self.files, self.faces, strict=True))
+
+    @property
+    def views(self) -> list[View]:
+        """All images, in the order of their indices."""
+        grids = (self.grid, *self.others)
+        return [(grid, int(face)) for grid in grids for face in grid.face_indices()]
 
 
 def write_cameras(path: Path, cameras: CameraFile) -> None:
@@ -145,29 +165,38 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
         path: File to write.
         cameras: Content of the file. Its section ``conventions`` explains the fields.
     """
-    grid = cameras.grid
+    grid, views = cameras.grid, cameras.views
     described: dict[str, Any] = {
-        "views": [_world_from_camera(grid, face) for face in grid.face_indices()],
-        "overlapping": grid.is_overlapping,
+        "views": [_world_from_camera(*view) for view in views],
+        "overlapping": grid.is_overlapping if grid.is_complete else overlaps(grid),
     }
-    if isinstance(grid, TangentGrid):
+    if isinstance(grid, TangentGrid) and not cameras.others:
         rotation = None if grid.rotation is None else _in_world(grid.rotation).tolist()
         described = {"base_level": grid.base_level, "level": grid.level, "dim": grid.dim}
         described |= {"icosahedron_rotation": rotation}
-    (rows, columns), (height, width) = grid.size, cameras.shape
-    matrix, fov_deg = grid.camera_matrix.tolist(), grid.width_deg
+    height, width = cameras.shape
     content = {
         "format": "tangent images",
         "conventions": _CONVENTIONS,
         "source": {"file": cameras.source, "height": height, "width": width},
         **described,
-        "camera": {"width": columns, "height": rows, "matrix": matrix, "fov_deg": fov_deg},
+        "camera": None if cameras.others else _camera(grid),
         "images": [
-            {"file": file, "face": face, "world_from_camera": _world_from_camera(grid, face)}
+            {
+                "file": file,
+                "face": face,
+                **({"camera": _camera(views[face][0])} if cameras.others else {}),
+                "world_from_camera": _world_from_camera(*views[face]),
+            }
             for face, file in zip(cameras.faces, cameras.files, strict=True)
         ],
     }
     _write_json(path, content)
+
+
+def _camera(grid: PinholeGrid) -> dict[str, Any]:
+    matrix, (rows, columns) = grid.camera_matrix.tolist(), grid.size
+    return {"width": columns, "height": rows, "matrix": matrix, "fov_deg": grid.width_deg}
 
 
 def _world_from_camera(grid: PinholeGrid, face: int) -> list[list[float]]:
@@ -230,9 +259,7 @@ class RigFile:
         return [prefix + name for prefix in self.world_from_camera for name in self.panoramas]
 
 
-def write_rig(
-    path: Path, grid: PinholeGrid, faces: Mapping[str, int], panoramas: Mapping[str, str]
-) -> None:
+def write_rig(path: Path, views: Mapping[str, View], panoramas: Mapping[str, str]) -> None:
     """Write a ``rig_config.json`` for COLMAP 3.12 or later.
 
     All cameras have COLMAP's model PINHOLE and the same center; principal points are counted from
@@ -240,17 +267,17 @@ def write_rig(
 
     Args:
         path: File to write.
-        grid: Geometry of the images.
-        faces: Index of the image of each camera, by prefix.
+        views: Image of each camera, by prefix.
         panoramas: See `RigFile`.
     """
     from scipy.spatial.transform import Rotation  # slow to import
 
-    (rows, columns), first = grid.size, next(iter(faces))
+    first, view = next(iter(views.items()))
+    of_first = _world_from_camera(*view)
     cameras: list[dict[str, Any]] = []
-    for prefix, face in faces.items():
-        axes = _world_from_camera(grid, face)
-        from_rig = np.transpose(axes) @ _world_from_camera(grid, faces[first])
+    for prefix, (grid, face) in views.items():
+        (rows, columns), axes = grid.size, _world_from_camera(grid, face)
+        from_rig = np.transpose(axes) @ of_first
         quaternion = Rotation.from_matrix(from_rig).as_quat(canonical=True, scalar_first=True)
         of_rig = {
             "cam_from_rig_rotation": quaternion.tolist(),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.io import pixel_files
-from tangent_train.io.camera_files import CameraFile
+from tangent_train.io.camera_files import CameraFile, View
 from tangent_train.io.gpano import PanoramaArea, read_area
 from tangent_train.rendering import Blend, Interpolation, equirect_to_tangent, tangent_to_equirect
 from tangent_train.rendering.resampling import reduce_to_pitch
@@ -68,9 +68,9 @@ def read_placed(
     return area.place(image), area
 
 
-def face_name(grid: PinholeGrid, face: int) -> str:
-    """Return the name of a tangent image, e.g. ``face_007``; names sort like the images."""
-    return f"face_{face:0{max(3, len(str(grid.num_images - 1)))}}"
+def face_name(face: int, count: int) -> str:
+    """Return the name of one of some images, e.g. ``face_007``; names sort like the images."""
+    return f"face_{face:0{max(3, len(str(count - 1)))}}"
 
 
 def flat_name(name: str) -> str:
@@ -84,8 +84,7 @@ def flat_name(name: str) -> str:
 
 def write_views(
     image: NDArray[Any],
-    grid: PinholeGrid,
-    files: Mapping[Path, int],
+    files: Mapping[Path, View],
     interpolation: Interpolation,
     progress: Callable[[float], object],
 ) -> None:
@@ -93,20 +92,23 @@ def write_views(
 
     Args:
         image: ``(H, W)`` or ``(H, W, C)`` panorama.
-        grid: Geometry of the images.
-        files: Index of the image of each file.
+        files: Image of each file.
         interpolation: See `equirect_to_tangent`.
         progress: Called with the share of the images written since its last call.
 
     Raises:
         SettingError: The panorama cannot be rendered, or the files cannot hold its pixels.
     """
+    reduced: dict[float, NDArray[Any]] = {}
     if interpolation == "bilinear":
-        image = reduce_to_pitch(image, grid.pitch)
+        pitches = {grid.pitch for grid, _ in files.values()}
+        reduced = {pitch: reduce_to_pitch(image, pitch) for pitch in pitches}
 
-    def write(item: tuple[Path, int]) -> None:
-        (pixels,) = equirect_to_tangent(image, grid, [item[1]], interpolation)
-        pixel_files.write_pixels(item[0], pixels)
+    def write(item: tuple[Path, View]) -> None:
+        path, (grid, face) = item
+        source = reduced.get(grid.pitch, image)
+        (pixels,) = equirect_to_tangent(source, grid, [face], interpolation)
+        pixel_files.write_pixels(path, pixels)
 
     with closing(in_threads(write, files.items())) as written:
         for _ in written:

@@ -4,7 +4,7 @@ NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on 
 by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
 """
 
-from tangent_train.rendering.forward import Blend, equirect_to_tangent, rotate_equirect
+from tangent_train.rendering.forward import Blend, equirect_to_tangent, perspective, rotate_equirect
 from tangent_train.rendering.mosaic import tangent_to_equirect, tangent_to_labels
 from tangent_train.rendering.representations.equirect import EquirectRepresentation
 from tangent_train.rendering.representations.icosphere import IcosphereRepresentation
@@ -29,6 +29,7 @@ __all__ = [
     "Representation",
     "TangentRepresentation",
     "equirect_to_tangent",
+    "perspective",
     "rotate_equirect",
     "set_table_cache_limit",
     "tangent_to_equirect",

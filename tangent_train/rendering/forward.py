@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from tangent_train.errors import SettingError, check_choice, check_type
-from tangent_train.geometry import PinholeGrid, checked_rotation
+from tangent_train.geometry import Angles, PinholeGrid, checked_rotation, perspective_grid
 from tangent_train.geometry.grids import Faces
 from tangent_train.rendering.resampling import Interpolation, Pixels, reduce_to_pitch
 from tangent_train.rendering.tables import (
@@ -29,6 +29,7 @@ from tangent_train.rendering.tables import (
     positions_of_rays,
     sphere_rays,
 )
+from tangent_train.rendering.traced import is_traced, traceable, traced
 
 Blend = Literal["nearest", "feather"]
 """``nearest``: each pixel is taken from the image that owns it. ``feather``: the average of all
@@ -45,6 +46,7 @@ _COPIED = 36
 """Largest part of a panorama that is copied, in bytes per position: copying more takes longer."""
 
 
+@traceable
 def equirect_to_tangent(
     image: Pixels,
     grid: PinholeGrid,
@@ -72,6 +74,8 @@ def equirect_to_tangent(
     Raises:
         SettingError: The panorama, a face or the interpolation cannot be used.
     """
+    if is_traced(image):
+        return traced("equirect_to_tangent", image, grid, faces, interpolation)
     check_panorama(image, interpolation)
     check_grid(grid)
     if interpolation == "bilinear":
@@ -97,6 +101,46 @@ def equirect_to_tangent(
         table = forward_map(grid, (image.shape[0], image.shape[1]), faces, dtype)
         sample_map(table, image, interpolation, out[start * rows : (start + step) * rows])
     return out.reshape(len(indices), rows, *out.shape[1:])
+
+
+@torch.compiler.disable
+def perspective(
+    image: Pixels,
+    yaw: Angles = 0.0,
+    pitch: Angles = 0.0,
+    fov: float | Sequence[float] = 90.0,
+    size: int | Sequence[int] = (640, 480),
+    roll: Angles = 0.0,
+    interpolation: Interpolation = "bilinear",
+) -> Pixels:
+    """Render perspective images of a panorama in some directions, see `equirect_to_tangent`.
+
+    Args:
+        image: An array ``(H, W[, C])``, or a tensor ``(..., C, H, W)``, differentiable.
+        yaw: Degrees to the right of the middle of the panorama; one, or one for each image.
+        pitch: Degrees above the horizon; one, or one for each image.
+        fov: Horizontal field of view in degrees, between the outer pixel edges; or the least
+            horizontal and vertical one, because pixels are square.
+        size: Width and height of the images in pixels, or one number for both.
+        roll: Degrees by which the camera is rolled clockwise; one, or one for each image.
+        interpolation: ``bilinear``, or ``nearest`` for labels, masks and depth.
+
+    Returns:
+        For lists of angles, an array ``(n, h, w[, C])`` or a tensor ``(..., n, C, h, w)``; without
+        the axis of the images if all angles are numbers.
+
+    Raises:
+        SettingError: The panorama, an angle or the size cannot be used.
+
+    >>> perspective(np.ones((32, 64, 3)), yaw=[0, 90, 180, 270], size=(40, 30)).shape
+    (4, 30, 40, 3)
+    """
+    # A rotation keeps the positions of many directions out of the large cache of tables.
+    grid = perspective_grid(yaw, pitch, fov, size, roll).with_rotation(np.eye(3))
+    images: Any = equirect_to_tangent(image, grid, None, interpolation)
+    if max(map(np.ndim, (yaw, pitch, roll))) == 0:
+        images = images.squeeze(-4) if isinstance(image, Tensor) else images[0]
+    return images
 
 
 def _sampled(image: Tensor, positions: Positions, interpolation: Interpolation) -> Tensor:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tangent_train.geometry.coverage import check_coverage
 from tangent_train.rendering.forward import (
     Blend,
     blend_of,
@@ -29,6 +30,7 @@ from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.resampling import Interpolation, Pixels
 from tangent_train.rendering.tables import nearest_pixels
 from tangent_train.rendering.torch_sums import TorchSums, fits_on
+from tangent_train.rendering.traced import is_traced, traceable, traced
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -251,6 +253,20 @@ class MeanMosaic(Mosaic):
         return (sums[:-1] / sums[-1]).where(sums[-1] >= least, torch.nan)
 
 
+def blend_back(grid: PinholeGrid, blend: Blend) -> Blend:
+    """Return the blend of images that cover the sphere, see `blend_of`.
+
+    Raises:
+        SettingError: There is no such blend, or the images miss a direction.
+    """
+    blend = blend_of(blend, is_overlapping=grid.is_overlapping)
+    if not grid.is_complete:
+        remedy = "Rendering back needs a larger fov or more views."
+        check_coverage([grid], by_owners=blend == "nearest", remedy=remedy)
+    return blend
+
+
+@traceable
 def tangent_to_equirect(
     images: Pixels,
     grid: PinholeGrid,
@@ -275,11 +291,14 @@ def tangent_to_equirect(
         A tensor ``(..., C, H, W)`` or an array ``(H, W[, C])``, of the dtype of the images.
 
     Raises:
-        SettingError: The images, the shape, the blend or the interpolation cannot be used.
+        SettingError: The images, the shape, the blend or the interpolation cannot be used, or the
+            images do not cover the sphere.
     """
+    if is_traced(images):
+        return traced("tangent_to_equirect", images, grid, shape, blend, interpolation)
     check_array("tangent images", images)
     check_grid(grid)
-    blend = blend_of(blend, is_overlapping=grid.is_overlapping)
+    blend = blend_back(grid, blend)
     check_interpolation(interpolation, blend)
     shape = check_shape(shape)
     check_images("tangent images", images, grid, interpolation)
@@ -296,6 +315,7 @@ def tangent_to_equirect(
     return result.reshape(*images.shape[:-4], images.shape[-3], *shape)
 
 
+@traceable
 def tangent_to_labels(
     logits: Pixels, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
 ) -> Pixels:
@@ -320,10 +340,12 @@ def tangent_to_labels(
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
     """
+    if is_traced(logits):
+        return traced("tangent_to_labels", logits, grid, shape, blend)
     check_array("scores", logits)
     check_grid(grid)
     scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
-    blend = blend_of(blend, is_overlapping=grid.is_overlapping)
+    blend = blend_back(grid, blend)
     shape = check_shape(shape)
     check_images("scores", scores, grid)
     is_summed = blend == "feather" and scores.device.type != "cpu"

@@ -203,6 +203,47 @@ def test_level_views_come_back_in_place(tmp_path: Path, blend: str, refused: Ref
 
 
 @pytest.mark.parametrize(
+    ("settings", "count", "size"),
+    [
+        ({"yaw": [0, 90, 180, 270], "pitch": 0, "fov": 90, "size": [64, 48]}, 4, (48, 64)),
+        ({"yaw": 30, "roll": 10, "level": 4}, 1, (16, 16)),
+        ({"fov": [90, 60], "yaw": [0, 90], "level": 5}, 2, (19, 32)),
+        ({"views": {"option": "horizontal", "rings": [{"pitch": 0, "views": 4}], "fov": [90, 60]}},
+         4, (32, 32)),
+        ({"views": "horizontal_wide"}, 16, (32, 32)),
+    ],
+)  # fmt: skip
+def test_views_that_miss_a_direction_are_rendered_but_not_back(
+    room: Path, tmp_path: Path, refused: Refused, settings: Any, count: int, size: tuple[int, int]
+) -> None:
+    render_with(input=room, output=tmp_path / "views", **settings)
+    content = json.loads((tmp_path / "views" / "room" / "cameras.json").read_text())
+    assert len(content["images"]) == count
+    for image in content["images"]:
+        pixels = _read(tmp_path / "views" / "room" / image["file"])
+        assert pixels.shape == (*size, 3)
+        camera = content["camera"] or image["camera"]
+        assert (camera["height"], camera["width"]) == size
+        rays = np.array(image["world_from_camera"]) @ np.linalg.inv(camera["matrix"])
+        x, y, z = rays @ (3, 5, 1)  # column 3, row 5
+        color = (np.array([x, -y, z]) / np.linalg.norm([x, y, z]) + 1) * 127.5
+        assert np.abs(pixels[5, 3] - color).max() <= 3
+    message = refused(back=tmp_path / "views", output=tmp_path / "back")
+    assert "several fields of view" in message or f"{count} views that miss" in message
+
+
+def test_directions_are_an_alternative_to_views(
+    room: Path, tmp_path: Path, refused: Refused
+) -> None:
+    message = refused(input=room, output=tmp_path / "no", yaw=[0, 90], dim=64)
+    assert "dim: found 64" in message
+    message = refused(input=room, output=tmp_path / "no", yaw=[0, 90], pitch=[1, 2, 3])
+    assert "yaw, pitch and roll" in message
+    message = refused(input=room, output=tmp_path / "no", faces=[0, 80])
+    assert "faces: found [0, 80]; expected indices of the 80 images" in message
+
+
+@pytest.mark.parametrize(
     ("rotation", "forward", "right"),
     [
         ([0, 0, 90], (1, 0, 0), (0, 0, -1)),  # clockwise: right goes down

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -19,8 +19,9 @@ from tangent_train.geometry import (
     random_rotation,
     xyz_to_lonlat,
 )
-from tangent_train.rendering import equirect_to_tangent, forward, tables
+from tangent_train.rendering import equirect_to_tangent, forward, perspective, tables
 from tangent_train.rendering.resampling import reduce_to_pitch, resize
+from tests.rendering.reference import sample_panorama
 
 Array = NDArray[Any]
 TURNED = TangentGrid(0, 5, rotation=random_rotation(np.random.default_rng(1)))
@@ -208,3 +209,49 @@ def test_only_sides_that_become_smaller_are_averaged(channels: tuple[int, ...]) 
     assert (resize(image, (16, 8), "bilinear") == 100).all()
     tensor = torch.from_numpy(stripes.astype(np.float32))[None].requires_grad_()
     assert torch.allclose(resize(tensor, (16, 8), "bilinear"), torch.tensor(100.0))
+
+
+@pytest.mark.parametrize(
+    ("yaw", "pitch", "roll"), [(0, 0, 0), (90, 60, 0), (-160, -85, 30), (20, 5, -135)]
+)
+def test_perspective_images_agree_with_the_textbook(yaw: float, pitch: float, roll: float) -> None:
+    """Pixels are rotated clockwise, then up, then to the right; on a focal length of w/2/tan."""
+    panorama = _random((32, 64, 3))
+    x, y = np.meshgrid(np.arange(40) - 19.5, np.arange(30) - 14.5)
+    a, b, c = np.radians([roll, pitch, yaw])
+    right, up = x * np.cos(a) - y * np.sin(a), -x * np.sin(a) - y * np.cos(a)
+    ahead = np.full_like(x, 20 / np.tan(np.radians(35)))
+    forward, up = ahead * np.cos(b) - up * np.sin(b), ahead * np.sin(b) + up * np.cos(b)
+    lonlat = np.stack(
+        [np.arctan2(right, forward) + c, np.arctan2(up, np.hypot(right, forward))], -1
+    )
+    expected = sample_panorama(panorama, lonlat, "bilinear")
+    found = perspective(panorama, yaw, pitch, 70, (40, 30), roll)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    tensor = torch.from_numpy(panorama).movedim(-1, 0)
+    images = perspective(tensor[None], [0, yaw], torch.tensor([0, pitch]), 70, (40, 30), [0, roll])
+    assert images.shape == (1, 2, 3, 30, 40)
+    np.testing.assert_allclose(images[0, 1].movedim(0, -1), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"yaw": [1, 2], "pitch": [1, 2, 3]}, "yaw, pitch and roll"),
+        ({"yaw": float("nan")}, "yaw, pitch and roll"),
+        ({"yaw": "left"}, "yaw, pitch and roll"),
+        ({"size": (640, 480, 3)}, "size"),
+        ({"size": 0.5}, "size"),
+        ({"fov": 180}, "fov"),
+    ],
+)
+def test_perspective_images_that_do_not_exist_are_refused(given: Any, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        perspective(np.ones((8, 16)), **given)
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.trace")
+def test_tracing_is_refused() -> None:
+    grid, trace = TangentGrid(0, 3), cast("Any", torch.jit.trace)
+    with pytest.raises(SettingError, match=r"torch\.compile"):
+        trace(lambda image: equirect_to_tangent(image, grid), torch.rand(3, 16, 32))

@@ -259,6 +259,7 @@ class HorizontalRepresentation(PinholeRepresentation):
     """
 
     grid: PinholeGrid
+    must_cover = True
 
     def __init__(
         self,
@@ -280,7 +281,8 @@ class HorizontalRepresentation(PinholeRepresentation):
             by_fov.setdefault(_pair(ring.get("fov", fov)), []).append(others)
         if not by_fov:
             raise SettingError("representation.rings", found="[]", expected="one ring or more")
-        if len(by_fov) > 1 and blend == "nearest":
+        is_joint = len(by_fov) > 1
+        if is_joint and blend == "nearest" and self.must_cover:
             raise SettingError(
                 "representation.blend",
                 found="nearest, with rings of different fov",
@@ -291,10 +293,10 @@ class HorizontalRepresentation(PinholeRepresentation):
         covered = None
         if area is not None:
             covered = area_mask(check_area(area, "representation.area"), (_ROWS, 2 * _ROWS))
-        is_joint = len(by_fov) > 1
-        coverage = {"by_owners": blend == "nearest", "is_complete": not is_joint}
+        is_complete = self.must_cover and not is_joint
+        coverage = {"by_owners": blend == "nearest", "is_complete": is_complete}
         grids = [RingGrid(part, of, size, None, covered, **coverage) for of, part in by_fov.items()]
-        if is_joint:
+        if is_joint and self.must_cover:
             check_coverage(grids, covered)
         self.symmetry_deg = 360 / max(ring["views"] for part in by_fov.values() for ring in part)
         super().__init__(
@@ -310,6 +312,12 @@ class HorizontalRepresentation(PinholeRepresentation):
             covered is not None,
             is_joint,
         )
+
+
+class SeparateViews(HorizontalRepresentation):
+    """Horizontal views for other programs, which need not cover the sphere."""
+
+    must_cover = False
 
 
 class CubemapRepresentation(PinholeRepresentation):
