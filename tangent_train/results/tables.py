@@ -12,6 +12,7 @@ from rich import table as rich_table
 from rich.console import Console
 from rich.text import Text
 
+from tangent_train.console import log_text
 from tangent_train.errors import printable
 
 _WIDEST = 10_000
@@ -56,6 +57,7 @@ class Table:
 
     def print(self) -> None:
         """Print the table; on a terminal, it is folded to the terminal's width."""
+        log_text(self.markdown())
         console = Console(highlight=False)
         if not console.is_terminal:
             console.width = _WIDEST
