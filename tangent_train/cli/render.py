@@ -152,7 +152,7 @@ def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
     image, _ = read_placed(job.path, kind, settings.area, job.value, channel)
     grid = _cameras(settings, image.shape[0]).grid
     if not isinstance(grid, TangentGrid):
-        raise SettingError("figure", found=path, expected=f"null, for views={settings.views}")
+        raise SettingError("figure", found=path, expected="null: only tangent images have a figure")
     write_pixels(path, tangent_figure(image, grid))
     print_text(f"Written: {path}")
 
@@ -192,8 +192,7 @@ def _grids(settings: RenderSettings, level: int) -> Sequence[PinholeGrid]:
         columns = ring_size(level, pair)[1]
         rows = math.ceil(columns * half_width(pair[1]) / half_width(pair[0]) - 1e-9)
         size = settings.size or (columns, rows)
-        angles = (getattr(settings, name) or 0.0 for name in _DIRECTIONS[:3])
-        yaw, pitch, roll = angles
+        yaw, pitch, roll = (0.0 if given[name] is None else given[name] for name in _DIRECTIONS[:3])
         grids: Sequence[PinholeGrid] = [perspective_grid(yaw, pitch, fov, size, roll)]
     else:
         section = view_settings(settings.views or {"option": "tangent", "base_level": 1})
