@@ -94,6 +94,8 @@ class ImageSettings(Settings):
     area: tuple[float, float, float, float] | None = None
     """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
     sphere"""
+    eye: Literal["left", "right"] | None = None
+    """stereo panoramas, two pictures above or beside each other: left | right; null = not stereo"""
 
 
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
@@ -133,7 +135,7 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     rotations: PositiveInt = 1
     """number of rotations about the vertical to average over"""
     upright: Literal["pose", "auto"] | None = None
-    """align with gravity: pose (GPano tags) | auto (the same, else estimated); null = off"""
+    """align with gravity: pose (tags of the file) | auto (the same, else estimated); null = off"""
     max_tilt_deg: float = 60
     """upright=auto: largest tilt to consider, in degrees"""
     mask: float | ExistingPath | None = None
