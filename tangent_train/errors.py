@@ -38,7 +38,7 @@ _ALIASES = {
         "arch architecture backbone model model_name net": "network checkpoint model",
         "data_dir data_path data_root dataset_path root root_dir": "data.root input",
         "data datamodule dataset": "data input",
-        "dir folder image image_dir images img input_dir inputs source src": "input data.root",
+        "dir folder image image_dir images img input input_dir source src": "input data.root",
         "path": "input data.root file model",
         "onnx": "file",
         "hub name repo repo_id url": "model",
