@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
+import datetime
+import errno
 import io
 import json
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -44,6 +48,17 @@ def atomic_path(path: Path) -> Iterator[Path]:
         _sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def checked_file(path: Path) -> Path:
+    """Return the path of a file; a pipe or device would be waited for.
+
+    Raises:
+        OSError: It is missing, a link to itself, or neither a file nor a folder.
+    """
+    if stat.S_IFMT(path.stat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
+        raise OSError(errno.EINVAL, "a pipe, socket or device", str(path))
+    return path
 
 
 def reserve(file: IO[bytes], size: int) -> None:
@@ -98,7 +113,8 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     import torch
 
     try:
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+        with torch.serialization.safe_globals(_plain_classes()):
+            return torch.load(checked_file(path), map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:
         is_read = not isinstance(error, OSError)
         found, remedy = "a damaged file, or not a file of torch.save" if is_read else error, ""
@@ -106,6 +122,22 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
             found = f"{named[1]}, a class"
             remedy = "Save only its state_dict(): reading objects can run arbitrary code."
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
+
+
+def _plain_classes() -> list[Any]:
+    """Return classes of plain values, which run nothing, with the names of other versions."""
+    import numpy as np
+    from numpy._core.multiarray import scalar
+
+    values: list[Any] = [argparse.Namespace, dict, list, int, float, set]
+    values.append((lambda *_: {}, "collections.defaultdict"))  # torch fills no subclass of dict
+    values += [datetime.datetime, datetime.date, datetime.time, datetime.timedelta]
+    values += [datetime.timezone, np.dtype, scalar, (scalar, "numpy.core.multiarray.scalar")]
+    values += [type(np.dtype(code)) for code in np.typecodes["All"].replace("O", "")]
+    for name in ("PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"):
+        path = PureWindowsPath if "Windows" in name else PurePosixPath
+        values += [(path, f"pathlib.{name}"), (path, f"pathlib._local.{name}")]
+    return values
 
 
 def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> Any:
@@ -121,7 +153,7 @@ def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> 
         DataError: The file cannot be read, is not JSON or has other content.
     """
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(checked_file(path).read_bytes())
         return content if kind is None else TypeAdapter(kind).validate_python(content)
     except (OSError, ValueError, RecursionError) as error:
         found = wrong_field(error) if isinstance(error, ValidationError) else error
@@ -179,3 +211,9 @@ def config_folder() -> Path:
     package = Path(__file__).resolve().parent
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
+
+
+def quoted(path: Path) -> str:
+    """Return a path as Hydra reads it literally."""
+    is_plain = re.fullmatch(r"[\w./-]+", str(path), re.ASCII)
+    return str(path) if is_plain else "'" + str(path).replace("'", "\\'") + "'"

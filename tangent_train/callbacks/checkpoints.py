@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import signal
 import threading
@@ -16,7 +17,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, T
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.console import print_text
-from tangent_train.files import atomic_path
+from tangent_train.files import atomic_path, quoted
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -88,8 +89,9 @@ class LastCheckpoint(Checkpoint):
     """Writes ``last.ckpt``, the newest state from which training can resume.
 
     It is written before the first step, after every epoch, after every `every_n_steps` steps, and
-    on SIGTERM, which a cluster sends before it kills a process: after the current step, or at the
-    end of the epoch if its steps are done. An interrupted run prints the command that resumes it.
+    on SIGTERM, which a cluster sends before it kills a process, or SIGHUP, when a terminal closes:
+    after the current step, or at the end of the epoch if its steps are done. An interrupted run
+    prints the command that resumes it.
 
     Args:
         folder: Folder of the checkpoints of a run.
@@ -100,11 +102,11 @@ class LastCheckpoint(Checkpoint):
     def __init__(self, folder: Path | str, every_n_steps: int | None = None) -> None:
         self.path = Path(folder) / "last.ckpt"
         self.every_n_steps = every_n_steps
-        self._has_begun = self._got_sigterm = False
+        self._has_begun, self._signal = False, 0
         self._processes: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save the untrained state of a new run, and handle SIGTERM.
+        """Save the untrained state of a new run, and handle SIGTERM and SIGHUP.
 
         Lightning's handler is not used: it communicates with the other processes inside the signal
         handler, which can deadlock.
@@ -113,13 +115,16 @@ class LastCheckpoint(Checkpoint):
         def handle(number: int, _: object) -> None:
             if trainer.strategy.launcher is not None:
                 trainer.strategy.launcher.kill(number)
-            self._got_sigterm = True
+            self._signal = number
 
         self._has_begun = True
         if trainer.world_size > 1:  # a separate group on the CPU, which does not wait for a GPU
             self._processes = torch.distributed.new_group(backend="gloo")
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, handle)  # Lightning restores the previous handler
+            signal.signal(signal.SIGTERM, handle)  # Lightning restores the previous handlers
+            hangup = getattr(signal, "SIGHUP", signal.SIGTERM)  # not on Windows
+            if signal.getsignal(hangup) != signal.SIG_IGN:  # as nohup leaves it
+                signal.signal(hangup, handle)
         if trainer.global_step == 0:
             trainer.save_checkpoint(self.path, weights_only=False)
 
@@ -137,14 +142,15 @@ class LastCheckpoint(Checkpoint):
         self._save(trainer, is_due=True)
 
     def _save(self, trainer: Trainer, *, is_due: bool) -> None:
-        """Save if it is due; if any process got SIGTERM, save and end all after the same step."""
-        ending = torch.tensor(int(self._got_sigterm))
+        """Save if it is due; if any process got a signal, save and end all after the same step."""
+        ending = torch.tensor(self._signal)
         if trainer.world_size > 1:
-            torch.distributed.all_reduce(ending, group=self._processes)
+            maximum = torch.distributed.ReduceOp.MAX
+            torch.distributed.all_reduce(ending, maximum, group=self._processes)
         if is_due or ending:
             trainer.save_checkpoint(self.path, weights_only=False)
         if ending:
-            raise SIGTERMException
+            raise SIGTERMException(int(ending))
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
@@ -154,7 +160,9 @@ class LastCheckpoint(Checkpoint):
             return
         if trainer.is_global_zero and self._has_begun and self.path.is_file():
             saved = "here" if isinstance(exception, SIGTERMException) else "the last checkpoint"
-            command = f"tangent-train {shlex.quote(f'resume={self.path.parent.parent}')}"
+            command = f"tangent-train {shlex.quote(f'resume={quoted(self.path.parent.parent)}')}"
+            if modules := os.environ.get("PYTHONPATH"):  # of classes of the user
+                command = f"PYTHONPATH={shlex.quote(modules)} {command}"
             text = f"{self.path} contains all up to {saved}; resume with\n  {command}"
             print_text(text, error=True)
 

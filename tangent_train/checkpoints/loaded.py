@@ -6,6 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from functools import cached_property
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +26,7 @@ from tangent_train.checkpoints.outputs import OutputNetwork
 from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
-from tangent_train.files import load_plain
+from tangent_train.files import checked_file, load_plain
 from tangent_train.io.gpano import Fill
 from tangent_train.kinds import DepthKind, ScoreKind
 
@@ -236,7 +237,16 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
     Raises:
         DataError: The file is missing, has other content, names classes that are not allowed, or
             its network cannot be built; or a package to read it is missing.
+        SettingError: A trusted package is missing.
     """
+    try:
+        checked_file(path)
+    except OSError as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
+    for name in trust:
+        if not name or find_spec(name.partition(".")[0]) is None:
+            expected = "a package that is installed, or a module or class in it"
+            raise SettingError("trust", found=name, expected=expected)
     onnx = OnnxNetwork(path) if path.suffix.lower() == ".onnx" else None
     if onnx is None:
         described = read_description(path)
@@ -261,11 +271,17 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
     except (RuntimeError, TypeError, AttributeError) as error:
         raise DataError(
             path,
-            found=f"other tensors than those of its network ({error})",
+            found=f"other tensors than those of its network ({_first_difference(error)})",
             expected=f"the tensors of {settings['_target_']}",
             remedy="Install the version of the network's package that it was trained with.",
         ) from error
     return LoadedNetwork(**vars(described), module=module.eval(), trust=tuple(trust))
+
+
+def _first_difference(error: Exception) -> str:
+    """Return the first difference that torch lists below the title of its message."""
+    lines = str(error).splitlines()
+    return first_line(lines[1] if len(lines) > 1 else error).strip()
 
 
 def read_description(path: Path) -> NetworkDescription | None:

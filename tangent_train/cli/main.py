@@ -7,12 +7,14 @@ misspelled override return immediately.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
 from tangent_train.errors import DataError, SettingError, printable
@@ -36,12 +38,29 @@ def _errors_as_messages(command: str) -> Iterator[None]:
         sys.exit(f"tangent-{command}: not enough memory. {error}. {remedy}")
     except (DataError, SettingError, OSError) as error:
         sys.exit(printable(f"tangent-{command}: {error}"))
-    except ValueError as error:
-        if "group override" not in str(error):  # Hydra's, of data=5
+    except Exception as error:
+        # Of Hydra for data=5, of Optuna if all runs fail, of Lightning.
+        text, kind = " ".join(str(error).split()), type(error).__name__
+        known = kind == "ValueError" and re.search("group override|No trials are completed", text)
+        if not known and kind != "MisconfigurationException":
             raise
-        sys.exit(f"tangent-{command}: {error}")
+        sys.exit(printable(f"tangent-{command}: {text}"))
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _run(command: str, settings: Any) -> Any:
+    """Run a command; runs have a log file."""
+    from hydra.core.hydra_config import HydraConfig
+
+    from tangent_train.console import log_to
+
+    name = {"import": "import_network"}.get(command, command)  # import is a keyword
+    function = getattr(import_module(f"tangent_train.cli.{name}"), name)
+    if command not in ("train", "evaluate") or os.environ.get("LOCAL_RANK", "0") != "0":
+        return function(settings)
+    with log_to(Path(HydraConfig.get().runtime.output_dir, f"{command}.log")):
+        return function(settings)
 
 
 def _main(command: str) -> None:
@@ -63,8 +82,7 @@ def _main(command: str) -> None:
             unread = f"no such setting: tangent-{command} does not read it"
             refuse_typed(settings.not_read, unread)
             import_module("tangent_train.cli.paths").check_paths(settings)
-            name = {"import": "import_network"}.get(command, command)  # import is a keyword
-            return getattr(import_module(f"tangent_train.cli.{name}"), name)(settings)
+            return _run(command, settings)
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors are raised here, not printed by Hydra
     with _errors_as_messages(command):

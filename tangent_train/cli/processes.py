@@ -5,18 +5,40 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import sys
 import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
 from tangent_train.config.settings import typed_settings
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
+from tangent_train.files import quoted
 
 OBJECTIVE_FILE = "validation.json"
 """File in a run's folder with the validation score of its best epoch."""
+
+
+class SweepSummary(Callback):
+    """Prints the scores of the runs of a sweep when it has ended, whoever has launched them."""
+
+    def on_multirun_end(self, config: Any, **_: Any) -> None:
+        """Print a line per run."""
+        folder = Path(config.hydra.sweep.dir)
+        for file in sorted(folder.rglob("results.json")):
+            content = json.loads(file.read_bytes())
+            name, best = next(iter(content["scores"])), file.with_name(OBJECTIVE_FILE)
+            scores = [f"{name} {content['scores'][name]:.4g}"]
+            if best.is_file():
+                validation = json.loads(best.read_bytes())
+                scores.append(f"{validation['figure']} {validation['best']:.4g}")
+            print_text(f"{file.parent}: {', '.join(scores)}")
+        print_text(f"A table of the settings: tangent-report {folder}")
 
 
 def in_sweep() -> bool:
@@ -35,7 +57,7 @@ def run_job(command: str) -> float | None:
 
     Raises:
         DataError: The run failed.
-        SettingError: The sweeper searches in the other direction.
+        SystemExit: The sweeper searches in the other direction, or a run of a search did not begin.
     """
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
@@ -46,7 +68,10 @@ def run_job(command: str) -> float | None:
     arguments += [f"--config-dir={path}" for path in sources]
     if status := run_process(command_line(command, arguments, folder)):
         found = f"a run that ended with status {status}"
-        raise DataError(folder, found=found, expected="a finished run")
+        error = DataError(folder, found=found, expected="a finished run")
+        if hydra.sweeper.get("max_failure_rate") and not (folder / "checkpoints").exists():
+            sys.exit(f"tangent-{command}: {error}")  # a search ends at a wrong setting
+        raise error
     file = folder / OBJECTIVE_FILE
     if not file.is_file():
         return None
@@ -54,8 +79,10 @@ def run_job(command: str) -> float | None:
     needed = f"{content['mode']}imize"
     found = hydra.sweeper.get("direction") or needed
     if found != needed:  # the sweeper would search for the worst score
-        raise SettingError(
-            "hydra.sweeper.direction", found=found, expected=f"{needed}, for {content['figure']}"
+        expected = f"{needed}, for {content['figure']}"
+        sys.exit(
+            f"tangent-{command}: "
+            f"{SettingError('hydra.sweeper.direction', found=found, expected=expected)}"
         )
     return float(content["best"])
 
@@ -76,8 +103,3 @@ def run_process(line: Sequence[str]) -> int:
     """Run a command, wait for it also after an interrupt, and return its status."""
     with subprocess.Popen(line, env=os.environ) as process:
         return process.wait()
-
-
-def quoted(path: Path) -> str:
-    """Return a path as Hydra reads it literally."""
-    return "'" + str(path).replace("'", "\\'") + "'"

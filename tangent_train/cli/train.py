@@ -14,7 +14,7 @@ from pathlib import Path
 import lightning
 import torch
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch.callbacks import EMAWeightAveraging
+from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, WeightAveraging
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
@@ -70,9 +70,11 @@ def train(settings: TrainSettings) -> float | None:
     last = LastCheckpoint(checkpoints, settings.checkpoint_every_n_steps)
     best = BestCheckpoint(checkpoints, run.task.monitor, run.task.head.mode_of(run.task.monitor))
     trainer = run.trainer([last, best])
-    if settings.ema is not None:  # the first callback: the saved average has the last step
-        average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings.ema)
-        trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
+    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    if settings.ema is not None:
+        callbacks.append(EMAWeightAveraging(trainer.strategy.root_device, decay=settings.ema))
+    # Averages first: a saved one has the last step.
+    callbacks.sort(key=lambda callback: not isinstance(callback, WeightAveraging))
     _fit(run, trainer, resumed)
     if resumed is not None:  # with changes, which did not keep the run from being resumed
         rank_zero_only(run.write_settings)()
@@ -101,7 +103,7 @@ def _create_folder(folder: Path) -> None:
 
 
 def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None) -> None:
-    """Train; a run that SIGTERM ends has saved a last checkpoint."""
+    """Train; a run that SIGTERM or SIGHUP ends has saved a last checkpoint."""
     if "SUBMITIT_EXECUTOR" in os.environ:  # SLURM announces the end of a job by SIGUSR2
         signal.signal(signal.SIGUSR2, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     with warnings.catch_warnings():
@@ -109,8 +111,8 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None) -> None:
             warnings.filterwarnings("ignore", message)
         try:
             trainer.fit(run.task, datamodule=run.data, ckpt_path=resumed, weights_only=True)
-        except SIGTERMException:
-            sys.exit(128 + signal.SIGTERM)
+        except SIGTERMException as ended:
+            sys.exit(128 + (ended.args or (signal.SIGTERM,))[0])
 
 
 def _tested_checkpoint(trainer: lightning.Trainer, best: BestCheckpoint, last: Path) -> Path:

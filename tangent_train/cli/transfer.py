@@ -35,12 +35,12 @@ from omegaconf import OmegaConf
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.cli import main
-from tangent_train.cli.processes import command_line, quoted, run_process
+from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.run import build_data
 from tangent_train.config.settings import SETTINGS, typed_names, typed_settings, validate
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
-from tangent_train.files import write_text
+from tangent_train.files import quoted, write_text
 from tangent_train.inference.engine import views_per_forward
 from tangent_train.inference.views import PERSPECTIVE, panorama_settings
 from tangent_train.manifest import Manifest

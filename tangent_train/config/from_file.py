@@ -34,7 +34,11 @@ _FUNCTIONS = (
 
 _OF_HYDRA = "_target_", "_partial_", "_convert_", "_recursive_"
 _WORD = re.compile(r"([A-Za-z0-9][\w.+ -]*)?", re.ASCII)
-_WEIGHTS = re.compile("weights|pretrained|checkpoint")
+_WEIGHTS = re.compile(
+    "(encoder_|backbone_)?weights(_backbone|_path)?|(checkpoint|weights)(_path|_file)?"
+    "|pretrained(_backbone|_cfg|_cfg_overlay|_path|_weights)?"
+)
+"""Arguments that name weights or checkpoints; `use_checkpoint` and `class_weights` do not."""
 
 
 def build_from_file(section: Any, place: str, path: Path, trust: Collection[str] = ()) -> Any:
@@ -68,7 +72,7 @@ def without_weights(section: Any) -> Any:
     if not isinstance(section, Mapping):
         return section
     return {
-        name: None if _WEIGHTS.search(str(name)) else without_weights(value)
+        name: None if _WEIGHTS.fullmatch(str(name)) else without_weights(value)
         for name, value in section.items()
     }
 

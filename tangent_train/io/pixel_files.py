@@ -24,7 +24,7 @@ from PIL.ExifTags import Base as Tag
 
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, of_extra, width_height
-from tangent_train.files import atomic_path, reserve, write_bytes
+from tangent_train.files import atomic_path, checked_file, reserve, write_bytes
 from tangent_train.io.decoders import decode_by_opencv, deep_to_srgb, load_whole, to_srgb
 from tangent_train.io.exr import open_exr, write_exr
 from tangent_train.io.image_files import (
@@ -85,7 +85,7 @@ def _opened(path: Path, channel: str | None = None) -> Iterator[_StoredImage]:
     """Open an image of an allowed size without decoding; errors in the block name the file."""
     try:
         # Not by its name: Pillow would map raw TIFF files into memory and rotate them wrongly.
-        with path.open("rb") as file:
+        with checked_file(path).open("rb") as file:
             stored = _open_stored(path, file, channel)
             if not 0 < math.prod(stored.size) <= MOST_PIXELS:
                 raise ValueError(f"{width_height(stored.size)}; 1 to {MOST_PIXELS} pixels")  # noqa: TRY301

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, of_extra
-from tangent_train.files import atomic_path
+from tangent_train.files import atomic_path, checked_file
 from tangent_train.threads import in_threads
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -165,7 +165,7 @@ def open_video(path: Path) -> Iterator[tuple[Any, Any]]:
     options = {"format_whitelist": _READERS, "protocol_whitelist": "file"}
     try:
         with av.open(
-            _file_url(path), container_options=options, metadata_errors="replace"
+            _file_url(checked_file(path)), container_options=options, metadata_errors="replace"
         ) as container:
             stream: Any = container.streams.best("video")
             if stream is None or stream.codec_context is None:
@@ -173,7 +173,7 @@ def open_video(path: Path) -> Iterator[tuple[Any, Any]]:
                 raise DataError(path, found="no video stream", expected=expected)
             stream.thread_type = "AUTO"
             yield container, stream
-    except av.FFmpegError as error:
+    except (av.FFmpegError, OSError) as error:
         raise DataError(
             path,
             found=f"a video that cannot be decoded ({error.strerror})",

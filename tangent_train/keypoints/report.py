@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from datamodules.core.panorama_pairs import PublishedPair
 from tangent_train.files import csv_text, write_text
 from tangent_train.keypoints.compare import AS_GIVEN, AUC_DEG, ROTATED, Comparison, Row
-from tangent_train.results.tables import Table, percent
+from tangent_train.results.tables import Table, markdown_text, percent
 
 _CONDITIONS = {AS_GIVEN: "As they are", ROTATED: "Right panorama randomly rotated"}
 _SCORES = ("pmr", "ms", "p")
@@ -78,7 +78,7 @@ def write_report(
             means.append(Table(title, header, cells, text_columns=(0, 1)))
             pairs.append(_per_pair(title, some, of_paper))
     tables = [table.markdown() for table in (*means, *pairs)]
-    head = f"# Keypoints\n\nSettings: {shown}.\n"
+    head = f"# Keypoints\n\nSettings: {markdown_text(shown)}.\n"
     write_text(folder / "keypoints.md", "\n".join([head, *visible, *tables]))
     return means
 

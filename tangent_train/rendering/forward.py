@@ -103,7 +103,6 @@ def equirect_to_tangent(
     return out.reshape(len(indices), rows, *out.shape[1:])
 
 
-@torch.compiler.disable
 def perspective(
     image: Pixels,
     yaw: Angles = 0.0,

@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 from tangent_train.errors import DataError, counted
 from tangent_train.files import csv_text, read_json, write_text
 from tangent_train.metrics.scores import BAND_EDGES_DEG, SOLID_ANGLE, Interval, ScoreColumn
-from tangent_train.results.tables import Table, score_text
+from tangent_train.results.tables import Table, markdown_text, score_text
 
 if TYPE_CHECKING:
     from tangent_train.heads import Head
@@ -324,5 +324,5 @@ def write_results(
     lines = [{**entry, **network} for entry in result.classes or [result.scores]]
     write_text(folder / "results.csv", csv_text(list(lines[0]), lines))
     tables = "\n".join(table.markdown() for table in (*result_tables(result), *published))
-    text = "\n\n".join(["# Results", *summary_lines(result), *notes, tables])
+    text = "\n\n".join(["# Results", *map(markdown_text, (*summary_lines(result), *notes)), tables])
     write_text(folder / "results.md", text)

@@ -14,7 +14,7 @@ from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation import EvaluationResult
 from tangent_train.results.published import published_rows
 from tangent_train.results.rows import Part, RunRow, check_alike, group_results
-from tangent_train.results.tables import Table, score_text
+from tangent_train.results.tables import Table, markdown_text, score_text
 
 Cell = tuple[str, str]
 """View and condition: row and column in the first table."""
@@ -164,7 +164,7 @@ class Report:
 
     def _markdown(self) -> str:
         first, *others = (table.markdown() for table in self.tables())
-        notes = "".join(f"- {note}\n" for note in self.notes)
+        notes = "".join(f"- {markdown_text(note)}\n" for note in self.notes)
         runs = [
             (row.label, str(r.fold or "–"), str(r.seed), str(r.folder))
             for row in self.rows

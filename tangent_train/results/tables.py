@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -11,6 +12,7 @@ from rich import table as rich_table
 from rich.console import Console
 from rich.text import Text
 
+from tangent_train.console import log_text
 from tangent_train.errors import printable
 
 _WIDEST = 10_000
@@ -46,15 +48,16 @@ class Table:
     def markdown(self) -> str:
         """Return the table as Markdown, below a heading."""
         rule = ["---" if k in self.text_columns else "---:" for k in range(len(self.header))]
-        rows = [[cell.replace("|", r"\|") for cell in row] for row in (self.header, *self.rows)]
+        rows = [[*map(markdown_text, row)] for row in (self.header, *self.rows)]
         rows.insert(1, rule)
-        lines = [f"## {self.title}", ""] if self.title else []
+        lines = [f"## {markdown_text(self.title)}", ""] if self.title else []
         lines += [f"| {' | '.join(row)} |" for row in rows]
-        lines += ["", self.note] if self.note else []
+        lines += ["", markdown_text(self.note)] if self.note else []
         return "\n".join(lines) + "\n"
 
     def print(self) -> None:
         """Print the table; on a terminal, it is folded to the terminal's width."""
+        log_text(self.markdown())
         console = Console(highlight=False)
         if not console.is_terminal:
             console.width = _WIDEST
@@ -103,6 +106,19 @@ class Table:
 def _shown(text: str) -> Text:
     """Return text for the terminal without markup: names of classes and files are untrusted."""
     return Text(printable(text))
+
+
+def markdown_text(text: str) -> str:
+    r"""Return text as Markdown of one line that shows it, without HTML, links and cells.
+
+    Names of runs, classes and files are untrusted.
+
+    >>> print(markdown_text("<b>sofa|[x](javascript:y)"))
+    &lt;b&gt;sofa\|\[x\](javascript:y)
+    """
+    line = escape(" ".join(printable(text).split("\n")), quote=False)
+    is_link = re.search(r"\][(\[:]", line)
+    return re.sub(r"[|\\\[\]]" if is_link else r"[|\\]", r"\\\g<0>", line)
 
 
 def percent(share: float | None) -> str:

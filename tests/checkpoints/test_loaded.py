@@ -132,3 +132,12 @@ def test_other_files_are_refused(content: Any, message: str, tmp_path: Path) -> 
         torch.save(content, path)
     with pytest.raises(DataError, match=f"{message}.*expected a network of tangent-train"):
         load_network(path)
+
+
+def test_only_arguments_that_name_weights_are_null() -> None:
+    kept = {"use_checkpoint": True, "class_weights": [1.0], "pretrained_window_size": 3}
+    null = ("weights", "encoder_weights", "weights_backbone", "pretrained", "checkpoint_path")
+    settings = {"_target_": "models.UNet", **kept, **dict.fromkeys(null, "imagenet")}
+    found = completed_settings(settings, 3, 2, restored=True)
+    assert {name: found[name] for name in kept} == kept
+    assert all(found[name] is None for name in null)

@@ -18,7 +18,7 @@ from tangent_train.checkpoints.loaded import load_network
 from tangent_train.cli.run import build_callbacks
 from tangent_train.tasks import PixelTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
-from tests.running import Capture, Patch, composed_settings, run_python
+from tests.running import ROOT, Capture, Patch, composed_settings, run_python
 from tests.tasks.shapes import shape_task
 
 CUT_SHORT = """
@@ -30,11 +30,25 @@ original = LastCheckpoint.on_train_batch_end
 
 def cut_short(self, trainer, *rest):
     if trainer.global_step == 2:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGHUP)
     original(self, trainer, *rest)
 
 LastCheckpoint.on_train_batch_end = cut_short
 train()
+"""
+
+
+OWN_EXPERIMENT = """
+# @package _global_
+defaults:
+  - rooms/demo
+callbacks:
+  mine:
+    _target_: lightning.pytorch.callbacks.EarlyStopping
+    monitor: null
+    mode: null
+    patience: 3
+    min_delta: 0.01
 """
 
 
@@ -48,6 +62,9 @@ def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     assert len(found["classes"]) == 13
     for name in ("results.md", "results.csv", "config.yaml", "validation.json"):
         assert (run_folder / name).is_file(), name
+    log = (run_folder / "train.log").read_text()
+    assert "mIoU" in log
+    assert "\n| wall |" in log, "the table of results"
     assert list((run_folder / "tensorboard").glob("events.*"))
     (panel,) = (run_folder / "panels").glob("*.png")
     picture = cv2.imread(str(panel))
@@ -65,11 +82,11 @@ def test_a_terminated_run_goes_on_as_if_nothing_had_happened(
 ) -> None:
     (tmp_path / "cut_short.py").write_text(CUT_SHORT)
     cut = run_python(tmp_path, "cut_short.py", *SETTINGS, rooms, "hydra.run.dir=cut")
-    assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
+    assert cut.returncode == 128 + signal.SIGHUP, cut.stderr
     assert "Traceback" not in cut.stderr
     printed = shlex.split(cut.stderr.strip().splitlines()[-1])
-    assert printed == ["tangent-train", f"resume={tmp_path / 'cut'}"]
-    run("train", printed[1])
+    assert printed == [f"PYTHONPATH={ROOT}", "tangent-train", f"resume={tmp_path / 'cut'}"]
+    run("train", printed[-1])
     found, expected = _last(tmp_path / "cut"), _last(run_folder)
     for part in ("state_dict", "optimizer_states"):
         torch.testing.assert_close(found[part], expected[part], rtol=0, atol=0)
@@ -143,6 +160,17 @@ def test_an_incomplete_test_leaves_no_results(
         (["+optimizer.x=1"], "optimizer: found .*argument 'x'"),
         (["+data.rooot=x"], "Did you mean data.root?"),
         (["network._target_=models.Absent"], "Absent"),
+        (
+            ["+callbacks.x={_target_: lightning.pytorch.callbacks.LearningRateFinder}"],
+            r"callbacks\.x: found LearningRateFinder; .*-m optimizer\.lr=",
+        ),
+        (
+            [
+                "+callbacks.x={_target_: lightning.pytorch.callbacks.StochasticWeightAveraging,"
+                " swa_lrs: 0.1}"
+            ],
+            r"callbacks\.x: found StochasticWeightAveraging; .*ema=",
+        ),
         (["task.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
     ],
 )
@@ -158,9 +186,13 @@ def test_an_early_stop_is_at_the_same_epoch_after_a_resume(
     rooms: str, run: Run, monkeypatch: Patch
 ) -> None:
     # The best epoch is the first one: nothing is learned.
-    settings = [*SETTINGS, rooms, "trainer.max_epochs=9", "scheduler=constant", "optimizer.lr=1e-9"]
-    settings += ["logger=csv", "callbacks=early_stopping", "callbacks.early_stopping.patience=3"]
-    settings += ["callbacks.early_stopping.min_delta=0.01"]
+    own = Path("configs", "experiment", "own.yaml")  # declares a callback
+    own.parent.mkdir(parents=True)
+    own.write_text(OWN_EXPERIMENT)
+    settings = ["--config-dir=configs", "experiment=own"]
+    settings += [text for text in SETTINGS if not text.startswith("experiment=")]
+    settings += [rooms, "trainer.max_epochs=9"]
+    settings += ["scheduler=constant", "optimizer.lr=1e-9", "logger=csv"]
     run("train", *settings, "hydra.run.dir=whole")
     start = PixelTask.on_train_epoch_start
 

@@ -60,7 +60,7 @@ def test_jobs_of_a_grid_are_runs_of_their_own_on_any_number_of_devices(
 
 @OLD_SQLALCHEMY
 def test_optuna_compares_runs_of_submitit_by_their_validation(
-    settings: tuple[str, ...], tmp_path: Path, run: Run
+    settings: tuple[str, ...], tmp_path: Path, run: Run, capfd: pytest.CaptureFixture[str]
 ) -> None:
     study = ("hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=2", "hydra.sweep.dir=study")
     run("train", "-m", "sweep=optuna", "launcher=local", *study, *settings)
@@ -69,6 +69,10 @@ def test_optuna_compares_runs_of_submitit_by_their_validation(
     (first,), (second,) = map(_writers, runs)
     assert len({os.getpid(), first, second}) == 3
     found = [json.loads((run / "validation.json").read_text()) for run in runs]
+    score = results(runs[1])["scores"]["miou"]
+    assert (
+        f"{runs[1]}: miou {score:.4g}, val/miou {found[1]['best']:.4g}\n" in capfd.readouterr().out
+    )
     assert [figure["figure"] for figure in found] == ["val/miou", "val/miou"]
     best = (tmp_path / "study" / "optimization_results.yaml").read_text()
     (value,) = re.findall(r"best_value: (\S+)", best)
@@ -80,6 +84,17 @@ def test_optuna_compares_runs_of_submitit_by_their_validation(
     ]
     assert len(set(rates)) == 2
     assert rate in rates
+
+
+@OLD_SQLALCHEMY
+def test_a_search_goes_on_after_runs_that_diverge(
+    settings: tuple[str, ...], tmp_path: Path, run: Run
+) -> None:
+    study = ("hydra.sweeper.n_trials=2", "hydra.sweep.dir=study", "optimizer.lr=choice(1e30,1e31)")
+    with pytest.raises(SystemExit, match="No trials are completed"):
+        run("train", "-m", "sweep=optuna", *study, *settings)
+    for number in "01":
+        assert "SettingError: loss of" in (tmp_path / "study" / number / "train.log").read_text()
 
 
 def test_failing_jobs_are_shown_and_do_not_stop_the_others(
