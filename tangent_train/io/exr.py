@@ -100,11 +100,9 @@ def _chosen_names(
     for name in names:
         layer, _, last = name.rpartition(".")
         layers.setdefault(layer, {})[last.upper()] = name
-    by_layer = {
-        name: [of[c] for c in "RGB"] for name, of in layers.items() if of.keys() >= {*"RGB"}
-    }
-    main = [name for name in by_layer if name.endswith("Combined")]  # of Blender
-    colors = [by_layer[name] for name in ([""] if "" in by_layer else main or by_layer)]
+    colors = [[of[c] for c in "RGB"] for of in layers.values() if of.keys() >= {*"RGB"}]
+    blender = [one for one in colors if one[0].endswith("Combined.R")]
+    colors = [one for one in colors if "." not in one[0]] or blender or colors
     depth = [[name] for name in names if _is_depth(name, names)]
     choices, expected = depth, "one channel of depth: Z, depth, depth.Z or depth.V in any layer"
     if channel is not None:
