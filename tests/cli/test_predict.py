@@ -27,7 +27,7 @@ from tests.rendering.drawn_room import draw_room
 from tests.running import Capture, Patch
 
 
-def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
+def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
     """Several formats and sizes, and broken files."""
     folder = tmp_path / "panoramas"
     output = tmp_path / "out"
