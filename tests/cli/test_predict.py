@@ -53,7 +53,7 @@ def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict) -> None:
     assert all("found" in entries[name]["error"] for name in ("broken", "phone"))
     with (output / "summary.csv").open(newline="") as file:
         rows = {Path(row["file"]).name: row for row in csv.DictReader(file)}
-    assert rows["broken.jpg"]["dark"] == ""
+    assert rows["broken.jpg"]["dark"] == rows["phone.HEIC"]["dark"] == ""
     assert rows["ab.png"]["dark"] == str(entries["ab"]["classes"]["dark"])
     names = json.loads((output / "classes.json").read_text())
     assert names == {"dark": [1], "green": [2], "bright": [3]}
