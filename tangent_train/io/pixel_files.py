@@ -294,6 +294,11 @@ def _warn_of_range(subject: object, largest: int) -> None:
         )
 
 
+def has_warned_of_range() -> bool:
+    """Return True if this run has printed that 16-bit colors have fewer bits."""
+    return bool(_has_warned[0])
+
+
 def read_rgb(image: Path | Image.Image, *, as_stored: bool = False) -> NDArray[np.uint8]:
     """Decode the colors of an image, ``(H, W, 3)``, in sRGB.
 
@@ -312,7 +317,8 @@ def read_rgb(image: Path | Image.Image, *, as_stored: bool = False) -> NDArray[n
     else:
         pixels = _displayed(_decode(image.copy(), None, "colors"), _orientation(image))
     if pixels.dtype == np.uint16:
-        _warn_of_range(image if isinstance(image, Path) else "image", int(pixels.max()))
+        if not as_stored:  # not labels
+            _warn_of_range(image if isinstance(image, Path) else "image", int(pixels.max()))
         pixels = (pixels >> 8).astype(np.uint8)
     subject = image if isinstance(image, Path) else "image"
     is_usable = pixels.dtype == np.uint8 and pixels.shape[2:] in ((), (3,))
