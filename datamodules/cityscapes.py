@@ -35,6 +35,7 @@ from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.io.image_files import glob_files
 from tangent_train.io.pixel_files import read_image_size
 
 CLASSES: tuple[str, ...] = (
@@ -101,7 +102,7 @@ class Cityscapes(PhotoDataModule):
         """See `DataModule`."""
         published: dict[Split, list[ImageFiles]] = {"train": [], "val": []}
         for split, found in published.items():
-            for rgb in sorted(self.root.glob(f"leftImg8bit/{split}/*/[!.]*_leftImg8bit.png")):
+            for rgb in glob_files(self.root, f"leftImg8bit/{split}/*/*_leftImg8bit.png"):
                 city, stem = rgb.parent.name, rgb.name.removesuffix("_leftImg8bit.png")
                 labels, camera = (
                     self.root / kind / split / city / f"{stem}_{end}"
@@ -109,7 +110,7 @@ class Cityscapes(PhotoDataModule):
                 )
                 name = f"{city}/{stem.removeprefix(f'{city}_')}"
                 found.append(ImageFiles(name, rgb, labels, None, None if self.fov else camera))
-            every = self.root.glob(f"gtFine/{split}/*/[!.]*_labelIds.png")
+            every = glob_files(self.root, f"gtFine/{split}/*/*_labelIds.png")
             self.problems.note_strays(every, found)
         self.problems.compare_counts(published, {"train": 2975, "val": 500})
         return published

@@ -32,6 +32,7 @@ from datamodules.core.files import ImageFiles, Split
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
+from tangent_train.io.image_files import glob_files
 
 _HEIGHT, _WIDTH = 400, 2048
 _LABELS = "_labelTrainIds.png"
@@ -67,8 +68,8 @@ class DensePASS(PanoramaDataModule):
         """See `DataModule`."""
         images, labels = (self.root / kind / "val" / "cs" for kind in ("leftImg8bit", "gtFine"))
         # Two spellings are in circulation: 1_.png and 1.png.
-        paths = {path.stem.removesuffix("_"): path for path in images.glob("[!.]*.png")}
+        paths = {path.stem.removesuffix("_"): path for path in glob_files(images, "*.png")}
         test = [ImageFiles(n, paths[n], labels / f"{n}{_LABELS}") for n in sorted(paths)]
         self.problems.compare_counts({"test": test}, {"test": 100})
-        self.problems.note_strays(labels.glob(f"[!.]*{_LABELS}"), test)
+        self.problems.note_strays(glob_files(labels, f"*{_LABELS}"), test)
         return {"test": test}

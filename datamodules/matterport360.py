@@ -35,6 +35,7 @@ from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.tables import read_table
+from tangent_train.io.image_files import glob_files
 
 _CATEGORIES = read_table("matterport360_classes")
 _SCENES = read_table("matterport360_scenes")
@@ -126,8 +127,7 @@ class Matterport360(PanoramaDataModule):
 
     def _list_images(self, scene: str) -> list[ImageFiles]:
         rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.release])
-        # Hidden files are leftovers of archives made on a Mac.
-        found = {path.stem: path for end in ("jpg", "png") for path in rgb.glob(f"[!.]*.{end}")}
+        found = {path.stem: path for end in ("jpg", "png") for path in glob_files(rgb, f"*.{end}")}
         images = []
         for stem, path in sorted(found.items()):
             labels, depth = (folder / f"{stem}.png" for folder in folders)

@@ -40,6 +40,7 @@ from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, P
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.stanford2d3ds.files import EIGHT
+from tangent_train.io.image_files import glob_files
 from tangent_train.io.pixel_files import read_image_size
 
 CLASSES: tuple[str, ...] = (
@@ -123,7 +124,7 @@ class Structured3DImages(ImageDataModule):
         pattern = f"{scenes}/{self.place.format(self.configuration)}/rgb_{self.lighting}.png"
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
         invalid = []
-        for rgb in sorted(self.root.glob(pattern)):
+        for rgb in glob_files(self.root, pattern):
             folder, _, room, _, _, *number, _ = rgb.relative_to(self.root).parts
             scene = folder.removeprefix("scene_")
             invalid += [scene] if scene in INVALID else []

@@ -35,6 +35,7 @@ from datamodules.core.files import SPLITS, ImageFiles, Split
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
+from tangent_train.io.image_files import glob_files
 
 CLASSES: tuple[str, ...] = (
     *("building", "fence", "other", "pedestrian", "pole", "road line", "road", "sidewalk"),
@@ -107,8 +108,8 @@ class SynPASS(PanoramaDataModule):
         chosen = [self.weather] if isinstance(self.weather, str) else self.weather
         for weather in ("cloud", "fog", "rain", "sun") if "all" in chosen else chosen:
             place = Path(weather, split)
-            labels += (self.root / "semantic" / place).glob("*/[!.]*_trainID.png")
-            for rgb in sorted((self.root / "img" / place).glob("*/[!.]*.jpg")):
+            labels += glob_files(self.root / "semantic" / place, "*/*_trainID.png")
+            for rgb in glob_files(self.root / "img" / place, "*/*.jpg"):
                 mask = self.root / "semantic" / place / rgb.parent.name / f"{rgb.stem}_trainID.png"
                 found.append(ImageFiles(f"{rgb.parent.name}/{weather}/{rgb.stem}", rgb, mask))
         self.problems.note_strays(labels, found)

@@ -13,7 +13,8 @@ from rich.console import Console
 
 from tangent_train.errors import printable
 
-_LOG = logging.getLogger("tangent_train")
+_LOG = logging.getLogger("tangent_train.printed")
+_LOG.propagate = False  # to log files only: Hydra prints what reaches its loggers
 
 
 @contextmanager

@@ -38,7 +38,12 @@ _ALIASES = {
         "arch architecture backbone model model_name net": "network checkpoint model",
         "data_dir data_path data_root dataset_path root root_dir": "data.root input",
         "data datamodule dataset": "data input",
-        "dir folder image image_dir images img input_dir inputs path source src": "input data.root",
+        "dir folder image image_dir images img input input_dir source src": "input data.root",
+        "path": "input data.root file model",
+        "onnx": "file",
+        "hub name repo repo_id url": "model",
+        "azimuth heading": "yaw",
+        "elevation": "pitch",
         "default_root_dir dst out out_dir output_dir output_path outputs save_dir save_path target "
         "work_dir log_dir run_dir": "output hydra.run.dir",
         "batch batch_size batchsize bs train_batch_size": "data.batch_size view_batch_size",
@@ -49,12 +54,13 @@ _ALIASES = {
         "wd weight_decay": "optimizer.weight_decay",
         "optim": "optimizer",
         "lr_schedule lr_scheduler sched": "scheduler",
-        "device devices gpu gpu_ids gpus n_gpus num_gpus": "trainer.devices device",
+        "device devices gpu gpu_ids gpus n_gpu n_gpus num_gpu num_gpus": "trainer.devices device",
         "amp dtype fp16 half": "trainer.precision",
         "grad_clip gradient_clip max_grad_norm": "trainer.gradient_clip_val",
         "accumulate gradient_accumulation_steps": "trainer.accumulate_grad_batches",
         "random_seed random_state seed_everything": "seed",
-        "image_size img_size imgsz level levels resolution": "level levels image_size",
+        "height image_size img_size imgsz input_size level levels resolution width": "level levels "
+        "image_size size",
         "config config_file exp": "experiment",
         "exp_name experiment_name run_name": "name",
         "loss_weights weight_classes": "task.head.class_weights",
@@ -62,6 +68,7 @@ _ALIASES = {
         "conf conf_thres confidence threshold": "min_confidence",
         "projection representation view views": "views representation",
         "tensorboard wandb": "logger",
+        "early_stop early_stopping patience": "callbacks",
         "force": "overwrite",
     }.items()
     for alias in aliases.split()

@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import csv
 import datetime
+import errno
 import io
 import json
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -46,6 +48,17 @@ def atomic_path(path: Path) -> Iterator[Path]:
         _sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def checked_file(path: Path) -> Path:
+    """Return the path of a file; a pipe or device would be waited for.
+
+    Raises:
+        OSError: It is missing, a link to itself, or neither a file nor a folder.
+    """
+    if stat.S_IFMT(path.stat().st_mode) not in (stat.S_IFREG, stat.S_IFDIR):
+        raise OSError(errno.EINVAL, "a pipe, socket or device", str(path))
+    return path
 
 
 def reserve(file: IO[bytes], size: int) -> None:
@@ -101,7 +114,7 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
 
     try:
         with torch.serialization.safe_globals(_plain_classes()):
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+            return torch.load(checked_file(path), map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:
         is_read = not isinstance(error, OSError)
         found, remedy = "a damaged file, or not a file of torch.save" if is_read else error, ""
@@ -140,7 +153,7 @@ def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> 
         DataError: The file cannot be read, is not JSON or has other content.
     """
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(checked_file(path).read_bytes())
         return content if kind is None else TypeAdapter(kind).validate_python(content)
     except (OSError, ValueError, RecursionError) as error:
         found = wrong_field(error) if isinstance(error, ValidationError) else error

@@ -3,16 +3,21 @@ from __future__ import annotations
 import argparse
 import collections
 import datetime
+import os
 import pickle
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import atomic_path, load_plain, write_text
+from tangent_train.files import atomic_path, load_plain, read_json, write_text
+from tangent_train.io.pixel_files import read_rgb
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -37,6 +42,24 @@ def test_errors_say_everything_and_survive_another_process(kind: type[DataError]
     assert str(error) == message
     assert str(pickle.loads(pickle.dumps(error))) == message
     assert isinstance(error, ValueError)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
+def test_pipes_and_circular_links_are_refused_at_once(tmp_path: Path) -> None:
+    pipe, link = tmp_path / "pipe", tmp_path / "link"
+    for suffix in ("", ".png", ".exr", ".onnx", ".ckpt"):
+        os.mkfifo(pipe.with_suffix(suffix))
+        link.with_suffix(suffix).symlink_to(link.with_suffix(suffix))
+    readers: list[tuple[Callable[[Path], Any], str]] = [
+        *((read_rgb, suffix) for suffix in (".png", ".exr")),
+        *((load_network, suffix) for suffix in (".onnx", ".ckpt")),
+        (lambda path: read_json(path, "JSON"), ""),
+        (lambda path: load_plain(path, "tensors"), ".ckpt"),
+    ]
+    for read, suffix in readers:
+        for path, found in ((pipe, "a pipe, socket or device"), (link, "Too many levels")):
+            with pytest.raises(DataError, match=found):
+                read(path.with_suffix(suffix))
 
 
 def test_published_files_with_plain_values_are_read(tmp_path: Path) -> None:

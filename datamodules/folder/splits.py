@@ -10,7 +10,8 @@ from lightning.pytorch.utilities import rank_zero_warn
 
 from datamodules.core.files import SPLITS, ImageFiles, Problems, Split, draw_groups
 from tangent_train.errors import DataError
-from tangent_train.io.image_files import composed
+from tangent_train.files import checked_file
+from tangent_train.io.image_files import composed, lower_suffix
 
 
 @dataclass(frozen=True)
@@ -73,16 +74,22 @@ class FolderSplits:
     ) -> dict[Split, set[str]]:
         """Read the names in each existing list: one per line, without comments (#)."""
         # Lists may name images with or without their suffix.
-        free = {f.name + suffix: f.name for f in images for suffix in ("", f.rgb.suffix)}
+        free = {lower_suffix(f.name + f.rgb.suffix): f.name for f in images}
+        free |= {f.name: f.name for f in images}
         listed: dict[Split, set[str]] = {}
         for split in SPLITS:
             path = self.root / f"{split}.txt"
-            if not path.is_file():
+            path = path if path.exists() else path.with_suffix(".TXT")
+            if not path.exists():
                 continue
-            lines = [composed(line.strip()) for line in path.read_text("utf-8-sig").splitlines()]
+            lines = [
+                composed(line.strip())
+                for line in checked_file(path).read_text("utf-8-sig").splitlines()
+            ]
             listed[split] = set()
             for line in lines:
-                name = free.get(line)
+                slashed = line.replace("\\", "/")  # of Windows
+                name = free.get(line) or free.get(slashed) or free.get(lower_suffix(slashed))
                 with problems.noted(f"{path.name}: {line}"):
                     if name in set().union(*listed.values()) or not (name or line[:1] in "#"):
                         expected = "names of files in images/, each once, e.g. scene/name"

@@ -35,6 +35,7 @@ from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.label_map import IMAGE_CLASS
 from datamodules.modelnet40.meshes import CHANNELS, mesh_spheres, read_mesh
 from tangent_train.geometry import random_rotation, rotation_about
+from tangent_train.io.image_files import glob_files
 from tangent_train.threads import in_processes
 
 MODELNET40 = (
@@ -92,7 +93,8 @@ def find_shapes(root: Path) -> list[ShapeFile]:
     """List all meshes of a data set, ordered by name within each part."""
     shapes = []
     for part in SPLITS[::2]:
-        for path in (*root.glob(f"*/{part}/[!.]*.off"), *root.glob(f"modelnet40_{part}/[!.]*.off")):
+        paths = glob_files(root, f"*/{part}/*.off") + glob_files(root, f"modelnet40_{part}/*.off")
+        for path in paths:
             by_class = path.parent.name == part
             label = path.parents[1].name if by_class else path.stem.rpartition("_")[0]
             name = path.relative_to(root).with_suffix("").as_posix()

@@ -47,6 +47,7 @@ from datamodules.stanford2d3ds import files as stanford
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
+from tangent_train.io.image_files import glob_files
 from tangent_train.io.pixel_files import read_depth_m
 
 GET_IT = (
@@ -78,8 +79,7 @@ def list_pictures(
         Images named ``area_3/office_2/<32 hex>``; photos, ``…/<frame>``.
     """
     folder, found = root / f"area_{area}" / group, []
-    # Hidden files are leftovers of archives made on a Mac.
-    images = sorted((folder / "rgb").glob("[!.]*.png"))
+    images = glob_files(folder / "rgb", "*.png")
     with problems.noted():
         if not images:
             expected = "camera_….png files"

@@ -21,6 +21,7 @@ from datamodules.zind.layout import DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose, rotation_about
+from tangent_train.io.image_files import glob_files
 
 GET_IT = (
     "Get the sample tour from https://github.com/zillow/zind or request the whole set there, and "
@@ -132,7 +133,7 @@ def list_home_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
         problems: Collects unreadable files.
     """
     found: list[HomePanorama] = []
-    for file in sorted(root.glob("*/zind_data.json")):
+    for file in glob_files(root, "*/zind_data.json"):
         with problems.noted(file.parent.name, file):
             home = read_json(file, "zind_data.json as released", kind=_HomeRecord)
             units_m = home.scale_meters_per_coordinate

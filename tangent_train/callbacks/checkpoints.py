@@ -17,7 +17,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, T
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.console import print_text
-from tangent_train.files import atomic_path, quoted
+from tangent_train.files import atomic_path, load_plain, quoted
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -39,6 +39,11 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         """
         with atomic_path(Path(path)) as temporary:
             torch.save(checkpoint, temporary)
+
+    def load_checkpoint(self, path: str | Path, *_: Any, **__: Any) -> dict[str, Any]:
+        """Load tensors and plain values, which callbacks may have stored too."""
+        content: dict[str, Any] = load_plain(Path(path), "a checkpoint of a run")
+        return content
 
 
 class CheckpointContents(Callback):

@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.utils import get_class
 from lightning.pytorch.loggers import (
     CSVLogger,
@@ -24,7 +23,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from tangent_train.config.build import build_from_config, filled
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, first_line
-from tangent_train.files import write_text
+from tangent_train.files import load_plain, write_text
 
 _IDENTITIES = {CSVLogger: "version", MLFlowLogger: "run_id", WandbLogger: "id"}
 """Arguments that continue a run; its `version` is their value."""
@@ -54,7 +53,7 @@ def start_loggers(
     stored = json.loads(file.read_bytes()) if resumed and file.is_file() else {}
     step = None
     if resumed and sections:
-        step = torch.load(resumed, map_location="cpu", weights_only=True, mmap=True)["global_step"]
+        step = load_plain(resumed, "a checkpoint of a run", mmap=True)["global_step"]
     for name, section in (sections or {}).items():
         try:
             loggers[name] = _build(name, section, folder, stored.get(name, {}), step)

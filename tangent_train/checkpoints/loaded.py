@@ -27,7 +27,7 @@ from tangent_train.checkpoints.outputs import OutputNetwork
 from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
-from tangent_train.files import load_plain
+from tangent_train.files import checked_file, load_plain
 from tangent_train.io.gpano import Fill
 from tangent_train.kinds import DepthKind, ScoreKind
 
@@ -240,6 +240,10 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
             its network cannot be built; or a package to read it is missing.
         SettingError: A trusted package is missing.
     """
+    try:
+        checked_file(path)
+    except OSError as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
     for name in trust:
         if not name or find_spec(name.partition(".")[0]) is None:
             expected = "a package that is installed, or a module or class in it"

@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
-from tangent_train.config.settings import EvaluateSettings, is_within, refuse_typed, typed_names
+from tangent_train.config.settings import EvaluateSettings, is_within, typed_names
 from tangent_train.errors import SettingError
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
@@ -30,7 +30,6 @@ def evaluate(settings: EvaluateSettings) -> None:
     if "data" in hydra.runtime.choices and not any(is_within(name, names) for name in typed):
         expected = "the data set of the evaluation, data=… or experiment=…"
         raise SettingError("data", found="nothing", expected=expected)
-    refuse_typed(settings.not_read, "no such setting: an evaluation does not read it")
     folder = Path(hydra.runtime.output_dir)
     _refuse_folder_of_run(folder)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)

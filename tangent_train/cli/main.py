@@ -71,7 +71,7 @@ def _main(command: str) -> None:
     from tangent_train.cli.processes import in_sweep, run_job
     from tangent_train.config.command_line import check_words
     from tangent_train.config.help import annotate, listed_by_files
-    from tangent_train.config.settings import config_name, validate
+    from tangent_train.config.settings import config_name, refuse_typed, validate
     from tangent_train.files import config_folder
 
     def job(config: Any) -> Any:
@@ -79,6 +79,8 @@ def _main(command: str) -> None:
             return run_job(command)
         with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions
             settings = validate(command, config)
+            unread = f"no such setting: tangent-{command} does not read it"
+            refuse_typed(settings.not_read, unread)
             import_module("tangent_train.cli.paths").check_paths(settings)
             return _run(command, settings)
 

@@ -43,7 +43,8 @@ def predict(settings: PredictSettings) -> None:
         SettingError: A setting is invalid, or the output was written with other settings.
         DataError: The checkpoint cannot be read, or no images are found.
     """
-    shard, inputs = Shard.parse(settings.shard), Inputs.find(settings.input, settings.every)
+    shard = Shard.parse(settings.shard)
+    inputs = Inputs.find(settings.input, settings.every, settings.eye, settings.area)
     prediction = _Prediction(settings)
     folder, names = prediction.folder, inputs.names
     content = settings.model_dump(mode="json", exclude={*settings.not_content})
@@ -168,12 +169,12 @@ class _Prediction:
 
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""
-        settings, image = self._settings, job.path if job.value is None else job.value()
+        settings, image = self._settings, job.value or job.path
         stem = job.name.removesuffix(job.path.suffix)
         depth = None if self._depth is None else partial(self._depth.read, stem)
         if settings.projection == "perspective":
             return images.read_photo(image, settings.fov, depth)
-        return images.read_panorama(image, settings.area, settings.upright, depth)
+        return images.read_panorama(image, settings.area, settings.upright, depth, settings.eye)
 
     def _upright(self, image: images.InputImage) -> images.InputImage:
         if self._settings.upright != "auto":
@@ -201,6 +202,8 @@ class _Prediction:
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         entry |= job.place
+        if self._settings.eye:
+            entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
         return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
@@ -219,7 +222,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
     names |= {"levels", "base_level", "blend", "write", "report", "shard"}
     names |= {"view_batch_size", "device", "trust"}
-    panoramas = {"area", "fill", "views", "upright", "mask", "rotations"}
+    panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()

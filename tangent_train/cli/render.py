@@ -36,7 +36,7 @@ from tangent_train.io.camera_files import (
     write_poses,
     write_rig,
 )
-from tangent_train.io.gpano import read_area
+from tangent_train.io.gpano import eye_part, read_area, read_tags, shape_of
 from tangent_train.io.inputs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_image_size, write_pixels
@@ -48,6 +48,7 @@ from tangent_train.io.tangent_folders import (
     result_files,
     write_views,
 )
+from tangent_train.io.videos import read_video_tags
 from tangent_train.keypoints.colmap import panorama_poses
 from tangent_train.manifest import Manifest
 from tangent_train.rendering.figure import tangent_figure
@@ -73,7 +74,7 @@ def render(settings: RenderSettings) -> None:
 
 def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     """Render panoramas to folders of tangent images, or to one project for COLMAP."""
-    inputs = Inputs.find(settings.input or "", settings.every)
+    inputs = Inputs.find(settings.input or "", settings.every, settings.eye, settings.area)
     if settings.figure is not None:
         _write_figure(settings, inputs, settings.figure)
     if settings.output is None:
@@ -95,7 +96,8 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     manifest = Manifest.open(output, content)
 
     def work(job: Job, progress: Callable[[float], object]) -> None:
-        image, area = read_placed(job.path, kind, settings.area, job.value, settings.depth_channel)
+        source = job.path, kind, settings.area, job.value, settings.depth_channel, settings.eye
+        image, area = read_placed(*source)
         shape = image.shape[0], image.shape[1]
         if settings.colmap:
             end = f"{flat_name(job.name)}{suffix}"
@@ -149,10 +151,10 @@ def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
     check_new(path, overwrite=settings.overwrite)
     job = next(iter(inputs.jobs(inputs.names)))
     kind, channel = settings.interpolation, settings.depth_channel
-    image, _ = read_placed(job.path, kind, settings.area, job.value, channel)
+    image, _ = read_placed(job.path, kind, settings.area, job.value, channel, settings.eye)
     grid = _cameras(settings, image.shape[0]).grid
     if not isinstance(grid, TangentGrid):
-        raise SettingError("figure", found=path, expected=f"null, for views={settings.views}")
+        raise SettingError("figure", found=path, expected="null: only tangent images have a figure")
     write_pixels(path, tangent_figure(image, grid))
     print_text(f"Written: {path}")
 
@@ -192,8 +194,7 @@ def _grids(settings: RenderSettings, level: int) -> Sequence[PinholeGrid]:
         columns = ring_size(level, pair)[1]
         rows = math.ceil(columns * half_width(pair[1]) / half_width(pair[0]) - 1e-9)
         size = settings.size or (columns, rows)
-        angles = (getattr(settings, name) or 0.0 for name in _DIRECTIONS[:3])
-        yaw, pitch, roll = angles
+        yaw, pitch, roll = (0.0 if given[name] is None else given[name] for name in _DIRECTIONS[:3])
         grids: Sequence[PinholeGrid] = [perspective_grid(yaw, pitch, fov, size, roll)]
     else:
         section = view_settings(settings.views or {"option": "tangent", "base_level": 1})
@@ -210,12 +211,15 @@ def _grids(settings: RenderSettings, level: int) -> Sequence[PinholeGrid]:
 
 def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
     """Return the rows of the largest panorama; files that cannot be read fail later."""
-    sizes: dict[Path, Any] = {video.path: video.size[1:] for video in inputs.videos.values()}
-    rows = []
+    sizes = {video.path: video.size[1:] for video in inputs.videos.values()}
+    rows, area = [], settings.area
     for path in [*sizes, *inputs.images.values()]:
         with suppress(DataError, SettingError):
+            tags = read_video_tags(path) if path in sizes else read_tags(path)
             size = sizes.get(path) or read_image_size(path)
-            rows.append(read_area(path, size, settings.area).full_shape[0])
+            if path not in sizes:
+                size = shape_of(size, eye_part(path, size, settings.eye, area, tags))
+            rows.append(read_area(path, size, area, tags=tags).full_shape[0])
     return max(rows, default=512)
 
 
@@ -276,8 +280,8 @@ _DIRECTIONS = ("yaw", "pitch", "roll", "fov", "size")
 _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set[str]]] = {
     "input": (
         _render_views,
-        {"every", "area", "views", "base_level", "level", "dim", "faces", "rotation", "format"}
-        | {*_DIRECTIONS}
+        {"every", "area", "eye", "views", "base_level", "level", "dim", "faces", "rotation"}
+        | {*_DIRECTIONS, "format"}
         | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"},
     ),
     "back": (_render_back, {"cameras", "blend", "height", "kind", "depth_channel", "z_depth"}),

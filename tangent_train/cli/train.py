@@ -12,7 +12,6 @@ import warnings
 from pathlib import Path
 
 import lightning
-import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging, WeightAveraging
 from lightning.pytorch.utilities import rank_zero_only
@@ -26,7 +25,7 @@ from tangent_train.cli.run import Run, build
 from tangent_train.config.settings import TrainSettings, refuse_typed
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
-from tangent_train.files import atomic_path, write_text
+from tangent_train.files import atomic_path, load_plain, write_text
 
 _EXPECTED_WARNINGS = (
     "Checkpoint directory .* exists and is not empty",  # a resumed run has checkpoints
@@ -82,7 +81,7 @@ def train(settings: TrainSettings) -> float | None:
     score = _best_validation_score(trainer, best, folder)
     tested = _tested_checkpoint(trainer, best, last.path)
     if len(run.data.dataset("test")):
-        weights = torch.load(tested, map_location="cpu", weights_only=True, mmap=True)
+        weights = load_plain(tested, "a checkpoint of a run", mmap=True)
         run.task.load_state_dict(weights["state_dict"])
         run.test(trainer, tested)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from argparse import ArgumentError
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -38,9 +39,13 @@ def check_words(command: str, arguments: Sequence[str]) -> None:
         SettingError: There is such a word.
     """
     parser = get_args_parser()
-    parser.allow_abbrev = False
-    parsed, others = parser.parse_known_args([*arguments])
+    parser.allow_abbrev, parser.exit_on_error = False, False
     expected = "settings as name=value"
+    try:
+        parsed, others = parser.parse_known_args([*arguments])
+    except ArgumentError as error:
+        name, found = str(error.argument_name).rpartition("/")[2], f"an {error.message}"
+        raise SettingError(name, found=found, expected=expected) from error
     for option in (word for word in others if word.startswith("-")):
         name = option.partition("=")[0].strip("-").replace("-", "_")
         config_name(command, ())

@@ -61,8 +61,8 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
     not_read: ClassVar[Sequence[str]] = ()
-    """Groups and settings that the command does not read, although experiments may set them. They
-    are not suggested."""
+    """Groups and settings, as regular expressions, that the command does not read, although
+    experiments may set them. They are refused on the command line and not suggested."""
     not_content: ClassVar[Sequence[str]] = ()
     """Settings that do not change the files in an output folder."""
 
@@ -95,6 +95,8 @@ class ImageSettings(Settings):
     area: tuple[float, float, float, float] | None = None
     """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
     sphere"""
+    eye: Literal["left", "right"] | None = None
+    """stereo panoramas, two pictures above or beside each other: left | right; null = not stereo"""
 
 
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
@@ -134,7 +136,7 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     rotations: PositiveInt = 1
     """number of rotations about the vertical to average over"""
     upright: Literal["pose", "auto"] | None = None
-    """align with gravity: pose (GPano tags) | auto (the same, else estimated); null = off"""
+    """align with gravity: pose (tags of the file) | auto (the same, else estimated); null = off"""
     max_tilt_deg: float = 60
     """upright=auto: largest tilt to consider, in degrees"""
     mask: float | ExistingPath | None = None
@@ -409,17 +411,11 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     not_read: ClassVar[Sequence[str]] = (
         *("network", "optimizer", "scheduler", "callbacks", "recipe", "ema"),
         *("checkpoint_every_n_steps", "validation_images", "data.color_jitter"),
-        *("representation.faces_per_panorama", "representation.random_rotation"),
-        *("representation.mirror", "task.auxiliary_weight", "task.backbone_lr_factor"),
-        *("task.frozen", "task.view_batch_size", "task.head.class_weights"),
-        *("task.head.label_smoothing", "task.head.loss", "task.head.scale_invariance"),
-        *("trainer.accumulate_grad_batches", "trainer.check_val_every_n_epoch"),
-        *("trainer.gradient_clip_algorithm", "trainer.gradient_clip_val"),
-        *("trainer.limit_train_batches", "trainer.limit_val_batches", "trainer.log_every_n_steps"),
-        *("trainer.max_epochs", "trainer.max_steps", "trainer.max_time", "trainer.min_epochs"),
-        *("trainer.min_steps", "trainer.num_sanity_val_steps", "trainer.overfit_batches"),
-        *("trainer.reload_dataloaders_every_n_epochs", "trainer.sync_batchnorm"),
-        "trainer.val_check_interval",
+        "representation.(faces_per_panorama|mirror|random_rotation)",
+        "task.(auxiliary_weight|backbone_lr_factor|frozen|view_batch_size)",
+        "task.head.(class_weights|label_smoothing|loss|scale_invariance)",
+        "trainer.(accumulate|check|gradient|limit_(train|val)|log|max|min|num_sanity)_.*",
+        "trainer.(overfit|reload|sync|val)_.*",
     )
 
     representation: Section | None = None  # type: ignore[assignment]
@@ -618,8 +614,8 @@ def typed_names() -> list[str]:
 
 
 def is_within(name: str, names: Collection[str]) -> bool:
-    """Return True for one of the names, and for a setting of such a group."""
-    return any(re.match(rf"{re.escape(one)}([.@]|$)", name) for one in names)
+    """Return True for one of the names, regular expressions, and for a setting of such a group."""
+    return any(re.match(rf"{one}([.@]|$)", name) for one in names)
 
 
 def dotted_names(section: Any, prefix: str = "") -> Iterator[str]:

@@ -58,8 +58,8 @@ def perspective_grid(
     try:
         angles = np.broadcast_arrays(*map(_degrees, (yaw_deg, pitch_deg, roll_deg)))
     except ValueError as error:
-        found = ", ".join(str(np.shape(angle)) for angle in (yaw_deg, pitch_deg, roll_deg))
-        expected = "degrees: numbers, or lists of one length"
+        found = ", ".join(str(angle) for angle in (yaw_deg, pitch_deg, roll_deg))
+        expected = "finite degrees: numbers, or lists of one length"
         raise SettingError("yaw, pitch and roll", found=found, expected=expected) from error
     axes = np.stack([view_rotation(*each) @ _FRONT for each in np.stack(angles, -1)])
     return PinholeGrid(axes, (rows, columns), pitch, is_overlapping=False)

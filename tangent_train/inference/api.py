@@ -50,7 +50,7 @@ from tangent_train.inference.images import (
     with_up,
 )
 from tangent_train.inference.views import Levels, ViewChoice, ViewSelector
-from tangent_train.io.gpano import Fill
+from tangent_train.io.gpano import Eye, Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
@@ -81,6 +81,7 @@ class ImageSettings(TypedDict, total=False):
     upright: Upright
     max_tilt_deg: float
     mask: Mask | str | NDArray[Any] | Tensor
+    eye: Eye | None
 
 
 @checks_types
@@ -201,6 +202,7 @@ class Network:
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
+        eye: Eye | None = None,
     ) -> NDArray[Any] | Tensor:
         """Return the label of every pixel.
 
@@ -217,6 +219,7 @@ class Network:
             max_tilt_deg: Largest tilt that ``auto`` considers, in degrees.
             mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
                 a file; or 0 in an array or tensor. See `Masks`.
+            eye: Eye of a stereo panorama, see `eye_part`; the labels are those of its picture.
 
         Returns:
             ``(H, W)`` labels 1 … K, and 0 for unknown pixels: an array of uint8 (uint16 for many
@@ -227,7 +230,7 @@ class Network:
             SettingError: The image cannot be used, or the network needs another input.
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        given = self._read(image, depth, fov, area, upright, max_tilt_deg)
+        given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye)
         found = self._predictor.predict(given).pixels().cpu().numpy()
         return _as_given(_masked(found, given, image, mask, 0), image)
 
@@ -243,6 +246,7 @@ class Network:
         area: Sequence[float] | None = None,
         upright: Upright = None,
         mask: Mask | str | NDArray[Any] | Tensor = None,
+        eye: Eye | None = None,
     ) -> NDArray[Any] | Tensor:
         """Return the depth of every pixel: distance from the center, or z-depth in photos.
 
@@ -252,6 +256,7 @@ class Network:
             area: See `labels`.
             upright: ``pose`` aligns a panorama with gravity by the GPano tags of its file.
             mask: Pixels of a panorama that get NaN, see `labels`.
+            eye: See `labels`.
 
         Returns:
             ``(H, W)`` float32, NaN where unknown: an array, or a tensor. In meters for networks
@@ -263,7 +268,7 @@ class Network:
             SettingError: See `labels`; or the views cannot be aligned in this way.
         """
         self.loaded.check_predicts(DISTANCE, "Use labels() or probabilities() of this network.")
-        given = self._read(image, None, fov, area, upright)
+        given = self._read(image, None, fov, area, upright, eye=eye)
         found = self._predictor.predict(given).pixels().cpu().numpy()
         return _as_given(_masked(found, given, image, mask, np.nan), image)
 
@@ -303,6 +308,7 @@ class Network:
         area: Sequence[float] | None = None,
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
+        eye: Eye | None = None,
     ) -> InputImage:
         """Return a photo, or a panorama with its zenith."""
         is_given = depth is not None or "depth" in self.loaded.inputs
@@ -310,7 +316,8 @@ class Network:
         if fov is not None:
             return read_photo(image, fov, of_size)
         check_choice("upright", upright or "pose", ("pose", "auto"))
-        panorama = read_panorama(image, area, upright, of_size)
+        check_choice("eye", eye or "left", ("left", "right"))
+        panorama = read_panorama(image, area, upright, of_size, eye)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._up_likelihood)
         return panorama

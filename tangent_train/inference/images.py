@@ -16,9 +16,10 @@ from datamodules.core.depth import meters_to_steps, resize_depth
 from datamodules.core.label_map import PIXEL_CLASSES
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
-from tangent_train.io.gpano import PanoramaArea, read_area, read_up
+from tangent_train.io.gpano import PanoramaArea, eye_part, read_area, read_tags, read_up
 from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.pixel_files import photo_fov_deg, read_depth_m, read_rgb
+from tangent_train.io.videos import Frame
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.rendering.resampling import resize
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from tangent_train.inference.engine import UpLikelihood
+    from tangent_train.io.gpano import Eye
     from tangent_train.kinds import Upright
 
     DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16]]
@@ -125,19 +127,21 @@ class DepthFolder:
 
 
 def read_panorama(
-    image: Picture,
+    image: Picture | Frame,
     angles: Sequence[float] | None = None,
     upright: Upright = None,
     depth: DepthOfSize | None = None,
+    eye: Eye | None = None,
 ) -> InputImage:
     """Read a panorama of the whole sphere or a part of it.
 
     Args:
-        image: The panorama; only files have GPano tags.
+        image: The panorama; only files and frames have GPano tags.
         angles: Part of the sphere that it covers, see `read_area`; None to use its GPano tags.
         upright: Source of the zenith: ``pose`` and ``auto`` read GPano tags (without tags,
             `with_up` estimates it for ``auto``); None for z.
         depth: Function that returns its depth.
+        eye: Eye of a stereo panorama, see `eye_part`; frames have only one.
 
     Returns:
         An image of the whole sphere, black outside its area.
@@ -145,16 +149,20 @@ def read_panorama(
     Raises:
         DataError: A file cannot be used, or the image is not a whole panorama.
         SettingError: The angles do not fit the image, the value is not an image, or an image in
-            memory has no pose.
+            memory or a frame has no pose.
     """
     rgb, path = _read(image)
-    size = rgb.shape[0], rgb.shape[1]
-    if upright == "pose" and path is None:
-        expected = "the path of a file: images in memory and videos have no GPano tags"
+    tags = image.tags if isinstance(image, Frame) else read_tags(path) if path else {}
+    if upright == "pose" and path is None and "PosePitchDegrees" not in tags:
+        expected = "the path of a file: images in memory and videos without metadata have no pose"
         raise SettingError("upright", found="pose", expected=expected)
-    area = read_area(path or _IN_MEMORY, size, angles)
+    path = path or _IN_MEMORY
+    if not isinstance(image, Frame):
+        rgb = rgb[eye_part(path, (rgb.shape[0], rgb.shape[1]), eye, angles, tags)]
+    size = rgb.shape[0], rgb.shape[1]
+    area = read_area(path, size, angles, tags=tags)
     steps = None if depth is None else area.place(depth(size))
-    up = None if upright is None or path is None else read_up(path)
+    up = None if upright is None else read_up(path, tags)
     return InputImage(area.place(rgb), steps, up, area=area)
 
 
@@ -173,7 +181,7 @@ def with_up(image: InputImage, max_tilt_deg: float, up_likelihood: UpLikelihood)
 
 
 def read_photo(
-    image: Picture, fov_deg: float | None = None, depth: DepthOfSize | None = None
+    image: Picture | Frame, fov_deg: float | None = None, depth: DepthOfSize | None = None
 ) -> InputImage:
     """Read a photo.
 
@@ -205,6 +213,8 @@ def _read(image: Any) -> tuple[NDArray[np.uint8], Path | None]:
     """Return an image as ``(H, W, 3)`` uint8, and the path of a file."""
     if isinstance(image, str | Path):
         return read_rgb(Path(image)), Path(image)
+    if isinstance(image, Frame):
+        return image(), None
     if isinstance(image, Image.Image):
         return read_rgb(image), None
     array = image.numpy(force=True) if isinstance(image, Tensor) else np.asarray(image)

@@ -50,7 +50,7 @@ def load_whole(image: Image.Image, file: IO[bytes]) -> Image.Image | NDArray[np.
             return pixels
     elif image.format == "PNG":
         Image.open(file, formats=["PNG"]).verify()
-    elif image.format == "WEBP" and not any(file.read()[-_LOST:]):
+    elif image.format in ("WEBP", "HEIF") and not any(file.read()[-_LOST:]):
         raise ValueError("zeros at the end of the file")
     image.load()
     return image

@@ -101,6 +101,8 @@ def _chosen_names(
         layer, _, last = name.rpartition(".")
         layers.setdefault(layer, {})[last.upper()] = name
     colors = [[of[c] for c in "RGB"] for of in layers.values() if of.keys() >= {*"RGB"}]
+    blender = [one for one in colors if one[0].endswith("Combined.R")]
+    colors = [one for one in colors if "." not in one[0]] or blender or colors
     depth = [[name] for name in names if _is_depth(name, names)]
     choices, expected = depth, "one channel of depth: Z, depth, depth.Z or depth.V in any layer"
     if channel is not None:
@@ -122,7 +124,7 @@ def _is_depth(name: str, names: Sequence[str]) -> bool:
     """Return True for a channel called depth, or Z or V in a layer called depth.
 
     Z is also depth without a layer or in a layer with colors, but not beside X: others are parts of
-    vectors, or passes such as mist. A single channel without a layer, e.g. Y, is depth.
+    vectors, or passes such as mist. A single Y is depth, which OpenCV writes, or distance.
     """
     *layers, last = name.lower().split(".")
     if last == "depth" or (layers[-1:] == ["depth"] and last in ("z", "v")):
@@ -131,7 +133,7 @@ def _is_depth(name: str, names: Sequence[str]) -> bool:
     beside = {n.lower().removeprefix(layer) for n in names if n.lower().startswith(layer)}
     has_colors = any(one.rpartition(".")[2] == "r" for one in beside)
     is_z = last == "z" and "x" not in beside and (not layer or has_colors)
-    return is_z or (not layer and len(names) == 1)
+    return is_z or (last in ("y", "distance") and len(names) == 1 and not layer)
 
 
 def write_exr(path: Path, pixels: NDArray[Any]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -27,8 +28,11 @@ from tangent_train.rendering.resampling import resize
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}RDF"
-_NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
-_SIZES = (
+_NAMESPACES = (
+    "http://ns.google.com/videos/1.0/spherical/",
+    "http://ns.google.com/photos/1.0/panorama/",
+)
+PART_TAGS = (
     "FullPanoWidthPixels",
     "FullPanoHeightPixels",
     "CroppedAreaImageWidthPixels",
@@ -41,12 +45,20 @@ _MOST_COLUMNS = 32768  # columns of the whole panorama
 _NOT_WHOLE = (
     "For a part of a panorama, give area=[west,east,south,north] in degrees, or GPano tags in its "
     "XMP data. For a photo, give fov=, its horizontal field of view in degrees; tangent-predict "
-    "also needs projection=perspective."
+    "also needs projection=perspective. For a stereo panorama, two pictures above or beside each "
+    "other, give eye=left or eye=right."
 )
 _SAME_AREA = (
     "All images of a data set show the same area: give data.area=[west,east,south,north] in degrees"
     " for a part of a panorama."
 )
+
+Eye = Literal["left", "right"]
+"""Eye of a stereo panorama; the left one is at the top, or at the left, unless tags differ."""
+
+_LAYOUTS = {"top-bottom": (2, 1), "left-right": (1, 2), "bottom-top": (2, 1), "right-left": (1, 2)}
+"""Pictures below and beside each other by `StereoMode`, which names the left eye first."""
+_UNTAGGED = ("top-bottom", "left-right")
 
 Fill = Literal["black", "mean", "edge", "reflect"]
 """Colors of a panorama outside its area: black; the mean color of the image; its nearest edge
@@ -153,6 +165,7 @@ def read_area(
     size: tuple[int, int],
     angles: Sequence[float] | None = None,
     remedy: str = _NOT_WHOLE,
+    tags: Mapping[str, str] | None = None,
 ) -> PanoramaArea:
     """Return the part of the sphere that an image shows.
 
@@ -165,6 +178,7 @@ def read_area(
         angles: West, east (−180 to 180; west > east for an image across ±180°), south and north
             (−90 to 90) in degrees; None to read the tags.
         remedy: Remedy for an image that is not a whole panorama.
+        tags: Its tags; None to read them.
 
     Raises:
         DataError: The image would not have square pixels, the tags contradict it, or the whole
@@ -175,8 +189,8 @@ def read_area(
     left, width = (west + 180) / 360, _width_deg(west, east) / 360
     top, height = (90 - north) / 180, (north - south) / 180
     shown = f"square pixels in area={[west, east, south, north]}"
-    tags = _read_properties(path) if angles is None else {}
-    if tags.keys() >= set(_SIZES) or not _is_equirect(tags):
+    tags = {} if angles else read_tags(path) if tags is None else tags
+    if tags.keys() >= set(PART_TAGS) or not _is_equirect(tags):
         shown = f"square pixels in the part of its GPano tags, {tags}"
         left, width, top, height = _tagged_part(tags)
     is_whole = width == height == 1
@@ -202,6 +216,61 @@ def read_area(
     return PanoramaArea((full_height, full_width), *bounds, size)
 
 
+def eye_part(
+    path: Path,
+    size: tuple[int, int],
+    eye: Eye | None,
+    angles: Sequence[float] | None,
+    tags: Mapping[str, str],
+) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that one eye sees.
+
+    A stereo panorama has two pictures of the same size, below or beside each other, by its
+    `StereoMode`; without it, in the layout in which they fit the area. Two whole panoramas are
+    below each other in a square image, and beside each other in one four times as wide as high.
+
+    Args:
+        path: File, for messages.
+        size: Rows and columns of the image.
+        eye: The eye; None for an image that is not stereo.
+        angles: See `read_area`.
+        tags: Its tags.
+
+    Raises:
+        DataError: It is stereo and no eye is given, or the other way round.
+    """
+    stated = tags.get("StereoMode", "").lower()
+    if eye is None and stated in _LAYOUTS:
+        raise DataError(
+            path,
+            found=f"a stereo panorama ({stated}), by its metadata",
+            expected="one picture",
+            remedy="Give eye=left or eye=right to use the picture of one eye.",
+        )
+    for layout in () if eye is None else (stated,) if stated in _LAYOUTS else _UNTAGGED:
+        rows, columns = (n // parts for n, parts in zip(size, _LAYOUTS[layout], strict=True))
+        second = (eye == "right") == (layout in _UNTAGGED)
+        top, left = (second * n % whole for n, whole in zip((rows, columns), size, strict=True))
+        with suppress(DataError):
+            read_area(path, (rows, columns), angles, tags=tags)
+            return slice(top, top + rows), slice(left, left + columns)
+    if eye is None:
+        return slice(None), slice(None)
+    raise DataError(
+        path,
+        found=f"{width_height(size)}, {stated or 'without stereo metadata'}",
+        expected=f"two pictures above or beside each other, for eye={eye}: each of a whole "
+        "panorama, twice as wide as high, or of area=",
+        remedy="Leave eye= out for a panorama of one picture.",
+    )
+
+
+def shape_of(size: tuple[int, int], part: tuple[slice, slice]) -> tuple[int, int]:
+    """Return rows and columns of a part of an image, see `eye_part`."""
+    rows, columns = (len(range(n)[taken]) for n, taken in zip(size, part, strict=True))
+    return rows, columns
+
+
 def _is_equirect(tags: Mapping[str, str]) -> bool:
     return tags.get("ProjectionType", "equirectangular").lower() == "equirectangular"
 
@@ -212,8 +281,12 @@ def _tagged_part(tags: Mapping[str, str]) -> tuple[float, float, float, float]:
     They are NaN if the tags are not those of a part of an equirectangular panorama.
     """
     full_width, full_height, width, height, left, top = (
-        _number(tags.get(name, "")) for name in _SIZES
+        _number(tags.get(name, "")) for name in PART_TAGS
     )
+    if math.isclose(full_width, full_height):  # of two pictures, below each other
+        full_height, height, top = full_height / 2, height / 2, top / 2
+    elif math.isclose(full_width, 4 * full_height):  # beside each other
+        full_width, width, left = full_width / 2, width / 2, left / 2
     is_inside = 0 < width <= full_width and 0 <= top <= full_height - height < full_height
     if not (
         _is_equirect(tags)
@@ -264,11 +337,12 @@ def black_outside(image: NDArray[_Pixel], valid: NDArray[np.bool_] | None) -> ND
     return np.where(mask, image, image.dtype.type(0))
 
 
-def read_up(path: Path) -> NDArray[np.float64] | None:
+def read_up(path: Path, tags: Mapping[str, str] | None = None) -> NDArray[np.float64] | None:
     """Return the up direction by the GPano tags of a panorama, see `up_from_pose`.
 
     Args:
         path: JPEG, PNG, TIFF or WebP.
+        tags: Its tags; None to read them.
 
     Returns:
         ``(3,)`` unit vector in the panorama's frame. None without tags, or with pitch and roll 0,
@@ -277,7 +351,7 @@ def read_up(path: Path) -> NDArray[np.float64] | None:
     Raises:
         DataError: A tag is not an angle.
     """
-    tags = _read_properties(path)
+    tags = read_tags(path) if tags is None else tags
     pitch, roll = (_number(tags.get(f"Pose{name}Degrees", "0")) for name in ("Pitch", "Roll"))
     if not (abs(pitch) <= 90 and abs(roll) <= 180):
         raise DataError(
@@ -289,8 +363,8 @@ def read_up(path: Path) -> NDArray[np.float64] | None:
     return None if pitch == roll == 0 else up_from_pose(pitch, roll)
 
 
-def _read_properties(path: Path) -> dict[str, str]:
-    """Read the simple GPano properties from the XMP data of an image, by local name.
+def read_tags(path: Path) -> dict[str, str]:
+    """Read the simple GPano and GSpherical properties from the XMP data of an image, by local name.
 
     A property may have any prefix, and may be an attribute or an element (XMP specification, part
     1). Properties of structures are ignored: they may describe another image.
@@ -300,7 +374,7 @@ def _read_properties(path: Path) -> dict[str, str]:
     """
     packet = read_xmp(path).strip(b"\0 \n")
     # A document type, which XMP does not have, could define entities that grow.
-    if _NAMESPACE.encode() not in packet or b"<!DOCTYPE" in packet:
+    if not any(name.encode() in packet for name in _NAMESPACES) or b"<!DOCTYPE" in packet:
         return {}
     try:
         nodes = [node for rdf in ElementTree.fromstring(packet).iter(_RDF) for node in rdf]
@@ -314,9 +388,9 @@ def _read_properties(path: Path) -> dict[str, str]:
     values: dict[str, str] = {}
     for node in nodes:
         values |= node.attrib | {child.tag: child.text or "" for child in node}
-    start = f"{{{_NAMESPACE}}}"
     return {
         name.removeprefix(start): value.strip()
+        for start in (f"{{{namespace}}}" for namespace in _NAMESPACES)
         for name, value in values.items()
         if name.startswith(start)
     }

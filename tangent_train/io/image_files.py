@@ -116,7 +116,12 @@ def is_wanted(path: Path, folder: Path = Path()) -> bool:
     [True, False, False, False]
     """
     inside = {part.lower() for part in path.parts} - {part.lower() for part in folder.parts}
-    return not path.name.startswith(".") and not inside & _SYSTEM_NAMES
+    return not any(part.startswith(".") or part in _SYSTEM_NAMES for part in inside)
+
+
+def glob_files(folder: Path, pattern: str) -> list[Path]:
+    """Return the sorted paths below a folder that match a pattern and are wanted."""
+    return sorted(path for path in folder.glob(pattern) if is_wanted(path, folder))
 
 
 def walk_files(folder: Path) -> Iterator[Path]:

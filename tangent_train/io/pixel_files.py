@@ -24,7 +24,7 @@ from PIL.ExifTags import Base as Tag
 
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, of_extra, width_height
-from tangent_train.files import atomic_path, reserve, write_bytes
+from tangent_train.files import atomic_path, checked_file, reserve, write_bytes
 from tangent_train.io.decoders import decode_by_opencv, deep_to_srgb, load_whole, to_srgb
 from tangent_train.io.exr import open_exr, write_exr
 from tangent_train.io.image_files import (
@@ -85,7 +85,7 @@ def _opened(path: Path, channel: str | None = None) -> Iterator[_StoredImage]:
     """Open an image of an allowed size without decoding; errors in the block name the file."""
     try:
         # Not by its name: Pillow would map raw TIFF files into memory and rotate them wrongly.
-        with path.open("rb") as file:
+        with checked_file(path).open("rb") as file:
             stored = _open_stored(path, file, channel)
             if not 0 < math.prod(stored.size) <= MOST_PIXELS:
                 raise ValueError(f"{width_height(stored.size)}; 1 to {MOST_PIXELS} pixels")  # noqa: TRY301
@@ -294,6 +294,11 @@ def _warn_of_range(subject: object, largest: int) -> None:
         )
 
 
+def has_warned_of_range() -> bool:
+    """Return True if this run has printed that 16-bit colors have fewer bits."""
+    return bool(_has_warned[0])
+
+
 def read_rgb(image: Path | Image.Image, *, as_stored: bool = False) -> NDArray[np.uint8]:
     """Decode the colors of an image, ``(H, W, 3)``, in sRGB.
 
@@ -312,7 +317,8 @@ def read_rgb(image: Path | Image.Image, *, as_stored: bool = False) -> NDArray[n
     else:
         pixels = _displayed(_decode(image.copy(), None, "colors"), _orientation(image))
     if pixels.dtype == np.uint16:
-        _warn_of_range(image if isinstance(image, Path) else "image", int(pixels.max()))
+        if not as_stored:  # not labels
+            _warn_of_range(image if isinstance(image, Path) else "image", int(pixels.max()))
         pixels = (pixels >> 8).astype(np.uint8)
     subject = image if isinstance(image, Path) else "image"
     is_usable = pixels.dtype == np.uint8 and pixels.shape[2:] in ((), (3,))

@@ -17,7 +17,8 @@ from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.io import pixel_files
 from tangent_train.io.camera_files import CameraFile, View
-from tangent_train.io.gpano import PanoramaArea, read_area
+from tangent_train.io.gpano import Eye, PanoramaArea, eye_part, read_area, read_tags
+from tangent_train.io.videos import Frame
 from tangent_train.rendering import Blend, Interpolation, equirect_to_tangent, tangent_to_equirect
 from tangent_train.rendering.resampling import reduce_to_pitch
 from tangent_train.threads import in_threads
@@ -39,8 +40,9 @@ def read_placed(
     path: Path,
     interpolation: Interpolation,
     angles: Sequence[float] | None = None,
-    frame: Callable[[], NDArray[np.uint8]] | None = None,
+    frame: Frame | None = None,
     channel: str | None = None,
+    eye: Eye | None = None,
 ) -> tuple[NDArray[Any], PanoramaArea]:
     """Read a panorama of any dtype; place a part of a panorama on the whole sphere.
 
@@ -48,8 +50,9 @@ def read_placed(
         path: An image, an array or a video.
         interpolation: With ``nearest``, images with a palette give its indices.
         angles: See `read_area`.
-        frame: Function that returns the frame of a video.
+        frame: Frame of a video, of one eye.
         channel: Channel of OpenEXR images, see `read_pixels`.
+        eye: Eye of a stereo image, see `eye_part`.
 
     Returns:
         ``(H, W)`` or ``(H, W, C)`` of the whole sphere, 0 outside of the part; and the part.
@@ -60,11 +63,12 @@ def read_placed(
     """
     is_nearest = interpolation == "nearest"
     if frame:
-        image = frame()
+        image, tags = frame(), frame.tags
     else:
         options: Any = {"indices": is_nearest, "in_srgb": not is_nearest, "channel": channel}
-        image = pixel_files.read_pixels(path, **options)
-    area = read_area(path, (image.shape[0], image.shape[1]), angles)
+        image, tags = pixel_files.read_pixels(path, **options), read_tags(path)
+        image = image[eye_part(path, (image.shape[0], image.shape[1]), eye, angles, tags)]
+    area = read_area(path, (image.shape[0], image.shape[1]), angles, tags=tags)
     return area.place(image), area
 
 

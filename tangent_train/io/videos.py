@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -14,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, of_extra
-from tangent_train.files import atomic_path
+from tangent_train.files import atomic_path, checked_file
+from tangent_train.io.gpano import PART_TAGS
 from tangent_train.threads import in_threads
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -37,8 +37,12 @@ _MOST_ASPECT = 16
 _PQ, _HLG = 16, 18  # transfer functions of Rec. ITU-R BT.2100
 _SRGB: dict[str, Any] = {"dst_color_trc": 13, "dst_color_primaries": 1}
 _PROJECTIONS = {1: "a cube map", 3: "half a sphere", 5: "a fisheye picture"}
-_STEREO = dict.fromkeys(range(1, 8), "two eyes (stereo)")
+_TILE = 2
+_STEREO = dict.fromkeys(range(3, 8), "interleaved pictures of two eyes (stereo)")
 """Values of FFmpeg's side data, ``AVSphericalProjection`` and ``AVStereo3DType``."""
+_HALVES = {(1, 0): "left-right", (1, 1): "right-left", (2, 0): "top-bottom", (2, 1): "bottom-top"}
+"""`StereoMode` by ``AVStereo3DType`` and inversion: the half of the left eye is named first."""
+_WHOLE = (slice(None), slice(None))
 _AHEAD = 2
 _USUAL_RATE = 30
 _ENCODER = "libx264"
@@ -52,10 +56,12 @@ class _Display(NamedTuple):
     Attributes:
         signs: ``(2, 2)`` signs of the transposed display matrix.
         options: Arguments of PyAV's ``reformat``: a size of square pixels, colors of sRGB.
+        tags: See `read_video_tags`.
     """
 
     signs: NDArray[np.int64] = _UPRIGHT_SIGNS
     options: dict[str, Any] = {}  # noqa: RUF012 - never changed
+    tags: dict[str, str] = {}  # noqa: RUF012 - never changed
 
 
 @dataclass(frozen=True)
@@ -67,16 +73,23 @@ class Frame:
         time_s: Presentation time in seconds.
         picture: Frame of PyAV.
         display: How it is shown.
+        half: Rows and columns that are used: those of one eye.
     """
 
     number: int
     time_s: float
     picture: Any
     display: _Display
+    half: tuple[slice, slice] = _WHOLE
 
     def __call__(self) -> NDArray[np.uint8]:
         """Return upright RGB with square pixels, ``(H, W, 3)``."""
-        return _upright(self.picture, self.display)
+        return np.ascontiguousarray(_upright(self.picture, self.display)[self.half])
+
+    @property
+    def tags(self) -> dict[str, str]:
+        """See `read_video_tags`."""
+        return self.display.tags
 
 
 def read_video_size(path: Path) -> tuple[int, int, int]:
@@ -100,7 +113,6 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
                 first = first or next(iter(packet.decode()), None)
         if first is None:
             raise DataError(path, found="no frame that can be decoded", expected="a whole video")
-        _check_layout(path, first)
         shape = _upright(first, _display(path, stream, first)).shape
         indexed = sum(entry.size > 0 for entry in stream.index_entries)
         # MP4 files have an index of all frames, the others a duration.
@@ -112,13 +124,32 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
     return declared, shape[0], shape[1]
 
 
-def read_frames(path: Path, frames: int | None = None, every: int = 1) -> Generator[Frame]:
+def read_video_tags(path: Path) -> dict[str, str]:
+    """Return the spherical metadata of a video as GPano tags, see `tangent_train.io.gpano`.
+
+    Returns:
+        Pose, area and `StereoMode`, as far as they are stated.
+
+    Raises:
+        DataError: They name a layout that cannot be used, or the video cannot be decoded.
+    """
+    with open_video(path) as (container, stream):
+        return _tags(path, next(container.decode(stream)))
+
+
+def read_frames(
+    path: Path,
+    frames: int | None = None,
+    every: int = 1,
+    half: tuple[slice, slice] = _WHOLE,
+) -> Generator[Frame]:
     """Yield the first and then every n-th frame of a video, decoded in a thread a few ahead.
 
     Args:
         path: Video file.
         frames: Number of frames, see `read_video_size`; None to read it.
         every: Step n between frames.
+        half: Rows and columns of each frame that are used.
 
     Yields:
         Frames, which convert themselves to RGB when they are called.
@@ -139,9 +170,8 @@ def read_frames(path: Path, frames: int | None = None, every: int = 1) -> Genera
                 display = _display(path, stream, picture) if number == 0 else display
                 if number % every == 0:
                     late = float(number / (stream.average_rate or _USUAL_RATE))
-                    yield Frame(
-                        number, late if picture.pts is None else picture.time, picture, display
-                    )
+                    time_s = late if picture.pts is None else picture.time
+                    yield Frame(number, time_s, picture, display, half)
                 number += 1
         if number != expected:
             raise DataError(
@@ -165,7 +195,7 @@ def open_video(path: Path) -> Iterator[tuple[Any, Any]]:
     options = {"format_whitelist": _READERS, "protocol_whitelist": "file"}
     try:
         with av.open(
-            _file_url(path), container_options=options, metadata_errors="replace"
+            _file_url(checked_file(path)), container_options=options, metadata_errors="replace"
         ) as container:
             stream: Any = container.streams.best("video")
             if stream is None or stream.codec_context is None:
@@ -173,7 +203,7 @@ def open_video(path: Path) -> Iterator[tuple[Any, Any]]:
                 raise DataError(path, found="no video stream", expected=expected)
             stream.thread_type = "AUTO"
             yield container, stream
-    except av.FFmpegError as error:
+    except (av.FFmpegError, OSError) as error:
         raise DataError(
             path,
             found=f"a video that cannot be decoded ({error.strerror})",
@@ -224,23 +254,35 @@ def _display(path: Path, stream: Any, frame: Any) -> _Display:
     if abs(aspect - 1) > _SQUARE:
         options["width"] = round(frame.width * max(aspect, 1))
         options["height"] = round(frame.height / min(aspect, 1))
-    return _Display(signs, options | (_SRGB if frame.color_trc in (_PQ, _HLG) else {}))
+    options |= _SRGB if frame.color_trc in (_PQ, _HLG) else {}
+    return _Display(signs, options, _tags(path, frame))
 
 
-def _check_layout(path: Path, frame: Any) -> None:
-    """Refuse a video whose side data name another layout than one equirectangular picture."""
-    kinds = {"SPHERICAL": _PROJECTIONS, "STEREO3D": _STEREO}
-    for kind, names in kinds.items():
-        data = frame.side_data.get(kind)
-        number = 0 if data is None else int.from_bytes(bytes(data)[:4], sys.byteorder)
-        if number in names:
-            raise DataError(
-                path,
-                found=f"a video with {names[number]}, by its metadata",
-                expected="one equirectangular picture, or a photo, in each frame",
-                remedy="Convert it, for example with FFmpeg's filter v360 or stereo3d. To remove "
-                "wrong metadata: ffmpeg -i <video> -c copy <new>.mp4.",
-            )
+def _tags(path: Path, frame: Any) -> dict[str, str]:
+    """Return the tags of `read_video_tags`, from the side data of the first frame."""
+    data = {kind: frame.side_data.get(kind) for kind in ("SPHERICAL", "STEREO3D")}
+    sphere, stereo = (
+        np.frombuffer(bytes(found or bytes(32))[:32], np.int32).tolist() for found in data.values()
+    )
+    if found := _PROJECTIONS.get(sphere[0]) or _STEREO.get(stereo[0]):
+        raise DataError(
+            path,
+            found=f"a video with {found}, by its metadata",
+            expected="equirectangular pictures, or photos, in each frame",
+            remedy="Convert it, for example with FFmpeg's filter v360 or stereo3d. To remove "
+            "wrong metadata: ffmpeg -i <video> -c copy <new>.mp4.",
+        )
+    tags = {}
+    if mode := _HALVES.get((stereo[0], stereo[1] & 1)):
+        tags["StereoMode"] = mode
+    if data["SPHERICAL"]:
+        tags["PosePitchDegrees"], tags["PoseRollDegrees"] = (str(n / 2**16) for n in sphere[2:4])
+    if sphere[0] == _TILE:  # shares of the sphere that are cropped at its edges
+        left, top, right, bottom = (n % 2**32 / 2**32 for n in sphere[4:])
+        size = 2 * (1 - left - right), 1 - top - bottom
+        part = dict(zip(PART_TAGS, (2, 1, *size, 2 * left, top), strict=True))
+        tags |= {name: str(value) for name, value in part.items()}
+    return tags
 
 
 def _upright(frame: Any, display: _Display) -> NDArray[np.uint8]:
@@ -257,6 +299,7 @@ def write_video(
     size: tuple[int, int, int],
     paint: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]],
     every: int = 1,
+    half: tuple[slice, slice] = _WHOLE,
 ) -> None:
     """Write a video (H.264 in MP4) with size, rate and frame times of another one, without sound.
 
@@ -267,6 +310,7 @@ def write_video(
         paint: Function that returns a new frame ``(H, W, 3)`` for the number of a frame and the
             upright source frame; called in threads.
         every: Step n: the first and then every n-th frame is written.
+        half: See `read_frames`; `size` has its rows and columns.
 
     Raises:
         DataError: The source cannot be decoded.
@@ -300,7 +344,7 @@ def write_video(
         encoder.codec_context.time_base = stream.time_base
         encoder.codec_context.colorspace = encoder.codec_context.color_primaries = _BT709
         encoder.codec_context.color_trc = _BT709
-        read = read_frames(source, expected, every)
+        read = read_frames(source, expected, every, half)
         with closing(in_threads(painted, read, ahead=_AHEAD)) as frames:
             for frame in frames:
                 output.mux(encoder.encode(frame))

@@ -148,7 +148,7 @@ def _sampled(image: Tensor, positions: Positions, interpolation: Interpolation) 
     shape = image.shape[-2], image.shape[-1]
     if interpolation == "nearest":
         return image.flatten(-2)[..., nearest_equirect_index(u, v, shape)]
-    return sample_tensor(image.reshape(-1, *shape), u, v).reshape(*image.shape[:-2], -1)
+    return sample_tensor(image.flatten(0, -3), u, v).unflatten(0, image.shape[:-2])
 
 
 def rotate_equirect(

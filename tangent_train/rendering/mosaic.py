@@ -82,7 +82,7 @@ class Mosaic:
         dtype: torch.dtype = torch.float32,
         spare: NDArray[np.float32] | None = None,
     ) -> None:
-        self.shape = shape
+        self.shape, self._dtype = shape, dtype
         self.blend: Blend = blend
         if backend is None:
             is_suitable = torch.device(device).type != "cpu" and fits_on(device, shape, channels)
@@ -106,8 +106,7 @@ class Mosaic:
             values: ``(n, K, h, w)`` scores, not probabilities; or other values.
             views: The views.
         """
-        values = values if values.dtype == torch.float64 else values.float()
-        images, views = views.on_canvas(values, self.shape)
+        images, views = views.on_canvas(values.to(self._dtype), self.shape)
         is_feathered = blend_of(self.blend, is_overlapping=views.is_overlapping) == "feather"
         self._backend.add(images, views, is_feathered=is_feathered)
 
@@ -351,7 +350,7 @@ def tangent_to_labels(
     is_summed = blend == "feather" and scores.device.type != "cpu"
     labels: list[Tensor] = []
     for stack in scores.reshape(-1, *scores.shape[-4:]):
-        if (unknown := without_softmax(stack)).any():
+        if not stack.sum().isfinite() and (unknown := without_softmax(stack)).any():
             # Minus infinity is a score that never wins; means skip it like NaN.
             stack = stack.float().masked_fill(unknown, torch.nan).clamp(min=_NEVER)  # noqa: PLW2901
             means = MeanMosaic(shape, blend, stack.shape[1], device=stack.device)

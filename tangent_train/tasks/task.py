@@ -316,7 +316,11 @@ class Task(lightning.LightningModule, ABC):
         for config in self.trainer.lr_scheduler_configs:
             is_due = (self.current_epoch + 1) % config.frequency == 0
             if is_due and isinstance(config.scheduler, ReduceLROnPlateau):
-                config.scheduler.step(self.trainer.callback_metrics[str(config.monitor)])
+                name, logged = str(config.monitor), self.trainer.callback_metrics
+                if name not in logged:
+                    expected = f"one of {', '.join(sorted(logged))}"
+                    raise SettingError("scheduler.monitor", found=name, expected=expected)
+                config.scheduler.step(logged[name])
 
     def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
         """Step schedulers as Lightning does, except for `ReduceLROnPlateau`."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
 import lightning
+import numpy as np
 import pytest
 import torch
 from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -40,6 +42,10 @@ class End(lightning.Callback):
 
     def __init__(self, batch: int | None, number: int) -> None:
         self.batch, self.number, self.count = batch, number, 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain values of a user's callback."""
+        return {"best": np.float64(0.5), "of": defaultdict(int, a=1)}
 
     def on_train_batch_end(self, *_: Any) -> None:
         self.count += 1

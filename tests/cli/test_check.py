@@ -10,6 +10,8 @@ import pytest
 
 from tangent_train.cli.check import check
 from tangent_train.cli.prepare import prepare
+from tangent_train.io import pixel_files
+from tangent_train.io.pixel_files import write_pixels
 from tests.datamodules.data_files import write_png
 from tests.datamodules.folder.folder_format import save, write_classes
 from tests.running import Capture, composed_settings
@@ -52,6 +54,19 @@ def test_shares_and_classes_that_do_not_occur(root: Path, capsys: Capture) -> No
         "Warning: Classes without a pixel for test: door, sofa (2 of 4).",
     ]
     assert "0 problems and 2 warnings; 3 panoramas of" in err
+
+
+def test_colors_of_12_bits_are_among_the_warnings(
+    root: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pixel_files, "_has_warned", bytearray(1))
+    monkeypatch.setenv("COLUMNS", "300")
+    write_pixels(root / "images" / "a.png", np.full((32, 64, 3), 4095, np.uint16))
+    classes = [None, "door", "wall", "floor", "sofa"]
+    write_classes(root, classes)
+    _out, err = _checked(root, capsys, "data.num_workers=0")
+    assert "a.png: the largest value of 16-bit colors is 4095" in err
+    assert "0 problems and 3 warnings; 3 panoramas of" in err
 
 
 def test_classes_of_other_labels(root: Path, capsys: Capture) -> None:

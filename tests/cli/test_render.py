@@ -256,8 +256,9 @@ def test_directions_are_an_alternative_to_views(
 ) -> None:
     message = refused(input=room, output=tmp_path / "no", yaw=[0, 90], dim=64)
     assert "dim: found 64" in message
-    message = refused(input=room, output=tmp_path / "no", yaw=[0, 90], pitch=[1, 2, 3])
-    assert "yaw, pitch and roll" in message
+    for pitch, shown in (([1, 2, 3], "(1.0, 2.0, 3.0)"), ([], "()")):
+        message = refused(input=room, output=tmp_path / "no", yaw=[0, 90], pitch=pitch)
+        assert f"yaw, pitch and roll: found (0.0, 90.0), {shown}, 0.0" in message
     message = refused(input=room, output=tmp_path / "no", faces=[0, 80])
     assert "faces: found [0, 80]; expected indices of the 80 images" in message
 

@@ -15,7 +15,7 @@ from tests.cli.tiny_runs import run_command
 from tests.config.test_settings import GIVEN
 from tests.running import Capture, Patch, composed_settings, run_python
 
-UNREAD = r"expected no such setting: an evaluation does not read it\."
+UNREAD = r"expected no such setting: tangent-evaluate does not read it\."
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +43,16 @@ def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
         ("predict net.onnx in out", "mean checkpoint=net.onnx input=in output=out?"),
         ("predict checkpoint=net.onnx in", "Did you mean input=in?"),
         ("render a(1).jpg", "Did you mean 'input=\"a(1).jpg\"'?"),
+        ("predict -c net.ckpt -i a.jpg", "-c: found an invalid choice: 'net.ckpt' "),
+        ("train n_gpu=1", "Did you mean trainer.devices?"),
+        ("train patience=3", "Did you mean callbacks?"),
+        ("import url=x", "Did you mean model?"),
+        ("import path=x", "Did you mean file or model?"),
+        ("render heading=x", "Did you mean yaw?"),
+        ("export input_size=8", "Did you mean image_size?"),
+        ("check input=x", "Did you mean data.root?"),
+        ("train inputs=[rgb]", "Did you mean data.inputs?"),
+        ("predict inputs=x", "Did you mean input?"),
         ("train fast", "fast: found a word without =; .*tangent-train --help lists them."),
         ("train experiment=rooms/demoo", "experiment: found rooms/demoo; .*mean rooms/demo?"),
         ("train recipe=small recipe/task=small_mine", "recipe/task: found small_mine; "),
@@ -103,6 +113,14 @@ def test_jobs_of_a_sweep_resolve_interpolations(tmp_path: Path, monkeypatch: Pat
 def test_an_evaluation_refuses_settings_of_a_training(setting: str, monkeypatch: Patch) -> None:
     with pytest.raises(SystemExit, match=f"{setting.partition('=')[0]}: found a value; {UNREAD}"):
         run_command(monkeypatch, "evaluate", "checkpoint=.", "data=synthrooms", setting)
+
+
+@pytest.mark.parametrize("command", ["check", "prepare"])
+def test_unread_settings_of_an_experiment_may_be_set_by_it_alone(
+    command: str, monkeypatch: Patch
+) -> None:
+    with pytest.raises(SystemExit, match=f"optimizer.lr: found a value; .*tangent-{command} does"):
+        run_command(monkeypatch, command, "experiment=rooms/demo", "optimizer.lr=1")
 
 
 @pytest.mark.parametrize("command", ["train", "predict", "report", "import"])

@@ -184,3 +184,39 @@ def hide_start(path: Path, seconds: float) -> None:
     duration, start = struct.unpack_from(">Ii", data, place)
     struct.pack_into(">Ii", data, place, duration, start + ticks)
     path.write_bytes(data)
+
+
+def stereo_box(mode: int) -> bytes:
+    """The box ``st3d`` of Spherical Video V2: 0 mono, 1 top-bottom, 2 left-right, 4 right-left."""
+    return _box(b"st3d", bytes(4), bytes([mode]))
+
+
+def projection_boxes(
+    kind: bytes,
+    pose_deg: tuple[float, float, float] = (0, 0, 0),
+    cropped: tuple[float, float, float, float] = (0, 0, 0, 0),
+) -> bytes:
+    """The box ``sv3d``: yaw, pitch, roll; shares cropped at the top, bottom, left and right."""
+    header = struct.pack(">4x3i", *(round(angle * 2**16) for angle in pose_deg))
+    content = struct.pack(">4x4I", *(round(share * 2**32) for share in cropped))
+    projection = _box(b"proj", _box(b"prhd", header), _box(kind, content))
+    return _box(b"sv3d", _box(b"svhd", bytes(5)), projection)
+
+
+def _box(name: bytes, *content: bytes) -> bytes:
+    return struct.pack(">I4s", 8 + sum(map(len, content)), name) + b"".join(content)
+
+
+def insert_boxes(path: Path, new: bytes) -> None:
+    """Insert boxes at the end of the sample entry of an MP4 file, whose moov box is its last."""
+    data, place, starts = bytearray(path.read_bytes()), 0, []
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b""):
+        while name and bytes(data[place + 4 : place + 8]) != name:
+            place += struct.unpack_from(">I", data, place)[0]
+        starts.append(place)
+        place += 16 if name == b"stsd" else 8
+    end = starts[-1] + struct.unpack_from(">I", data, starts[-1])[0]
+    data[end:end] = new
+    for start in starts:
+        struct.pack_into(">I", data, start, struct.unpack_from(">I", data, start)[0] + len(new))
+    path.write_bytes(data)

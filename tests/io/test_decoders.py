@@ -185,7 +185,7 @@ _DAMAGES = ("second half", "no end", "cut", "middle")
     ("suffix", "damage"),
     [
         *product((".jpg", ".png", ".avif"), _DAMAGES),
-        *product((".webp",), _DAMAGES[:3]),  # without a checksum, some damage decodes
+        *product((".webp", ".heic"), _DAMAGES[:3]),  # without a checksum, some damage decodes
     ],
 )
 def test_damaged_files_are_refused(tmp_path: Path, suffix: str, damage: str) -> None:

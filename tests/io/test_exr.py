@@ -108,6 +108,7 @@ def test_the_channel_of_depth_is_found(tmp_path: Path, others: list[str], name: 
         ["L.Mist.Z"],
         [*_BLENDER, "L.UV.U", "L.UV.V"],
         ["G", "B", "V", "Y"],
+        *(["A"], ["R"], ["V"], ["mask"], ["Image.V"], ["L.Z"]),
         ["Depth.R", "Depth.G", "Depth.B", *_RGBA],
         ["L.Depth.Z", "M.Depth.Z"],
         ["Z", "depth.Z"],
@@ -129,7 +130,7 @@ def test_other_channels_are_refused_unless_named(tmp_path: Path, names: list[str
         read_depth_m(path, 1000, "albedo")
 
 
-def test_colors_are_those_of_the_only_layer(tmp_path: Path) -> None:
+def test_colors_are_those_of_the_main_or_only_layer(tmp_path: Path) -> None:
     half = _DEPTH.astype(np.float16)
     channels: dict[str, Any] = {"L.Combined.R": half, "L.Combined.G": 2 * half}
     channels |= {"L.Combined.B": 3 * half, "L.Combined.A": half, "L.Depth.Z": _DEPTH}
@@ -139,7 +140,12 @@ def test_colors_are_those_of_the_only_layer(tmp_path: Path) -> None:
     np.testing.assert_array_equal(colors, np.stack([half, 2 * half, 3 * half], -1))
     with pytest.raises(DataError, match="expected colors of 8 or 16 bits"):
         read_rgb(path)
-    path = _write(path, channels | {f"L.DiffCol.{c}": half for c in "RGB"})
+    path = _write(path, channels | {f"L.CryptoObject00.{c}": half for c in "rgb"})
+    np.testing.assert_array_equal(read_pixels(path, indices=False), colors)
+    bare = dict.fromkeys("RGB", _DEPTH) | {f"crypto00.{c}": half for c in "rgba"}
+    path = _write(path, channels | bare)
+    np.testing.assert_array_equal(read_pixels(path, indices=False), np.stack([_DEPTH] * 3, -1))
+    path = _write(path, {f"{name}.{c}": half for name in ("L.N", "L.DiffCol") for c in "RGB"})
     with pytest.raises(DataError, match="expected one layer with the channels R, G and B"):
         read_pixels(path, indices=False)
 

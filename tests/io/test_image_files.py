@@ -7,7 +7,7 @@ import pytest
 from PIL import features
 
 from tangent_train.errors import DataError
-from tangent_train.io.image_files import NamedFiles, find_depth, image_paths
+from tangent_train.io.image_files import NamedFiles, find_depth, glob_files, image_paths
 
 
 def _touch(*paths: Path) -> None:
@@ -53,6 +53,8 @@ def test_patterns_select_images(tmp_path: Path) -> None:
     assert names("[ab]1.jpg") == ["a1.jpg", "b1.jpg"]
     assert names("**/a?.*") == ["a1.jpg", "a2.png", "s/a3.JPG", "s/t/a4.jpg"]
     assert image_paths(tmp_path / "@eaDir" / "*.jpg") == [tmp_path / "@eaDir" / "a7.jpg"]
+    _touch(tmp_path / "s" / "._a3.JPG", tmp_path / ".trash" / "a8.JPG", tmp_path / "@eaDir/a9.JPG")
+    assert glob_files(tmp_path, "*/*.JPG") == [tmp_path / "s" / "a3.JPG"], "of data sets"
 
 
 @pytest.mark.parametrize(

@@ -420,6 +420,8 @@ def test_colors_of_few_bits_are_warned_of_once(
     for name in "ab":
         path = tmp_path / f"{name}{suffix}"
         write_pixels(path, np.full((4, 8, 3), 2**bits - 1, np.uint16))
+        read_rgb(path, as_stored=True)  # labels in colors
+        assert not (name == "a" and pixel_files.has_warned_of_range())
         read_rgb(path)
     printed = capsys.readouterr().err
     assert printed.count("Warning: ") == (bits < 16)

@@ -14,8 +14,9 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.io.videos import read_frames, read_video_size, write_video
-from tests.datamodules.data_files import hide_start
+from tangent_train.io.gpano import PART_TAGS
+from tangent_train.io.videos import read_frames, read_video_size, read_video_tags, write_video
+from tests.datamodules.data_files import hide_start, insert_boxes, projection_boxes, stereo_box
 
 av: Any = pytest.importorskip("av")
 
@@ -240,48 +241,45 @@ def test_the_display_size_decides(
     assert difference.max() <= 2, "half a pixel of the ramps, and rounding"
 
 
-def _box(name: bytes, *content: bytes) -> bytes:
-    return struct.pack(">I4s", 8 + sum(map(len, content)), name) + b"".join(content)
-
-
-def _insert(path: Path, new: bytes) -> None:
-    """Insert boxes at the end of the sample entry of an MP4 file, whose moov box is its last."""
-    data, place, starts = bytearray(path.read_bytes()), 0, []
-    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"):
-        while data[place + 4 : place + 8] != name:
-            place += struct.unpack_from(">I", data, place)[0]
-        starts.append(place)
-        place += 8 + {b"stsd": 8, b"avc1": 78}.get(name, 0)
-    end = starts[-1] + struct.unpack_from(">I", data, starts[-1])[0]
-    data[end:end] = new
-    for start in starts:
-        struct.pack_into(">I", data, start, struct.unpack_from(">I", data, start)[0] + len(new))
-    path.write_bytes(data)
-
-
-def _projection(content: bytes) -> bytes:
-    header = _box(b"prhd", bytes(16))
-    return _box(b"sv3d", _box(b"svhd", bytes(5)), _box(b"proj", header, content))
+_FLAT = projection_boxes(b"equi")
+_TILE = projection_boxes(b"equi", (0, -24.5, 8.75), (0.25, 0, 0.125, 0.5))
+_POSE = {"PosePitchDegrees": "-24.5", "PoseRollDegrees": "8.75"}
+_PART = dict(zip(PART_TAGS, ("2", "1", "0.75", "0.75", "0.25", "0.25"), strict=True))
 
 
 @pytest.mark.parametrize(
-    ("boxes", "found"),
+    ("boxes", "tags"),
     [
-        (_projection(_box(b"equi", bytes(20))), ""),
-        (_projection(_box(b"cbmp", bytes(12))), "a cube map"),
-        (_box(b"st3d", bytes(4), b"\1"), "two eyes"),
-        (_box(b"st3d", bytes(4), b"\2") + _projection(_box(b"equi", bytes(20))), "two eyes"),
+        (b"", {}),
+        (_FLAT, dict.fromkeys(_POSE, "0.0")),
+        (_TILE, _POSE | _PART),
+        (stereo_box(0), {}),
+        (stereo_box(1), {"StereoMode": "top-bottom"}),
+        (stereo_box(2) + _TILE, {"StereoMode": "left-right"} | _POSE | _PART),
+        (projection_boxes(b"cbmp"), "a cube map"),
     ],
 )
-def test_layouts_that_the_metadata_name(tmp_path: Path, boxes: bytes, found: str) -> None:
-    """Boxes of Google's Spherical Video V2."""
+def test_layouts_that_the_metadata_state(
+    tmp_path: Path, boxes: bytes, tags: dict[str, str] | str
+) -> None:
+    """Boxes of Google's Spherical Video V2: angles of 16.16 and shares of 0.32 bits."""
     path = _write(tmp_path / "a.mp4")
-    _insert(path, boxes)
-    if not found:
+    insert_boxes(path, boxes)
+    if not isinstance(tags, str):
         assert read_video_size(path) == (_COUNT, 64, 128)
+        assert read_video_tags(path) == next(read_frames(path)).tags
+        assert read_video_tags(path) == tags
         return
-    with pytest.raises(DataError, match=f"found a video with {found}"):
+    with pytest.raises(DataError, match=f"found a video with {tags}"):
         read_video_size(path)
+
+
+@pytest.mark.parametrize("mode", ["left-right", "right-left", "top-bottom", "bottom-top"])
+def test_the_eyes_of_matroska(tmp_path: Path, mode: str) -> None:
+    def setup(stream: Any) -> None:
+        stream.metadata["stereo_mode"] = mode.replace("-", "_")
+
+    assert read_video_tags(_write(tmp_path / "a.mkv", setup=setup)) == {"StereoMode": mode}
 
 
 def test_endless_pixels_are_refused(tmp_path: Path) -> None:

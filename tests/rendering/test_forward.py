@@ -231,14 +231,16 @@ def test_perspective_images_agree_with_the_textbook(yaw: float, pitch: float, ro
     tensor = torch.from_numpy(panorama).movedim(-1, 0)
     images = perspective(tensor[None], [0, yaw], torch.tensor([0, pitch]), 70, (40, 30), [0, roll])
     assert images.shape == (1, 2, 3, 30, 40)
+    assert perspective(tensor[None][:0], [0, 9], size=8).shape == (0, 2, 3, 8, 8)
     np.testing.assert_allclose(images[0, 1].movedim(0, -1), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"yaw": [1, 2], "pitch": [1, 2, 3]}, "yaw, pitch and roll"),
-        ({"yaw": float("nan")}, "yaw, pitch and roll"),
+        ({"yaw": [1, 2], "pitch": [1, 2, 3]}, r"found \[1, 2\], \[1, 2, 3\], 0.0; expected finite"),
+        ({"yaw": float("nan")}, "found nan, 0.0, 0.0"),
+        ({"yaw": []}, r"found \[\], 0.0, 0.0"),
         ({"yaw": "left"}, "yaw, pitch and roll"),
         ({"size": (640, 480, 3)}, "size"),
         ({"size": 0.5}, "size"),

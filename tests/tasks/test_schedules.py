@@ -15,6 +15,7 @@ import torch
 from torch.optim import lr_scheduler
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
+from tangent_train.errors import SettingError
 from tangent_train.tasks.optimization import Schedule, warmup_cosine
 from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
 
@@ -136,3 +137,22 @@ def test_a_plateau_is_stepped_after_every_nth_epoch(tmp_path: Path) -> None:
     more: dict[str, Any] = {"limit_val_batches": 1, "max_epochs": 6, "check_val_every_n_epoch": 2}
     rates = _train(tmp_path, schedule, **more)
     assert rates[::STEPS] == pytest.approx([LR, LR, LR, LR, LR / 2, LR / 2])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"interval": "epochs"}, "scheduler.interval: found 'epochs'; expected 'epoch' or 'step'"),
+        ({"frequency": 0}, "scheduler.frequency: found 0; expected an integer of 1 or more"),
+        ({"frequency": 1.5}, "scheduler.frequency: found 1.5; expected an integer"),
+    ],
+)
+def test_a_wrong_timing_is_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        Schedule(partial(lr_scheduler.StepLR, step_size=1), **settings)
+
+
+def test_a_plateau_of_an_unknown_score_is_refused(tmp_path: Path) -> None:
+    scheduler = Schedule(partial(lr_scheduler.ReduceLROnPlateau, mode="min"), monitor="val/none")
+    with pytest.raises(SettingError, match=r"scheduler\.monitor: found val/none; expected one of "):
+        _train(tmp_path, scheduler, max_epochs=1)

@@ -42,12 +42,15 @@ def test_whole_scenes_are_drawn_by_share_and_seed(tmp_path: Path, erp: Any) -> N
 
 def test_lists_of_all_splits(own_root: Path, erp: Any) -> None:
     lists = {
-        "train": "\ufeffscene_5/view.1\n\n# the kitchen\nscene_0/view.0.png\r\n",
-        "val": "scene_1/view.1",
+        "train": "\ufeffscene_5/view.1\n\n# the kitchen\nscene_0/view.0.PNG\r\n",
+        "val": "scene_1\\view.1",  # as Windows writes it
         "test": "scene_0/view.1\nscene_3/view.0\n",
     }
     for split, text in lists.items():
         (own_root / f"{split}.txt").write_text(text, "utf-8")
+    (own_root / "val.txt").rename(own_root / "val.TXT")
+    for path in sorted(own_root.glob("labels/*/*.png")):
+        path.rename(path.with_suffix(".PNG"))
     module = FolderPanoramas(own_root, erp)
     assert _all_names(module) == {
         "train": ["scene_0/view.0", "scene_5/view.1"],

@@ -158,7 +158,9 @@ def _write_colmap_model(project: Path) -> None:
     """A project, and a model in which one of its images has a pose."""
     model = project / "sparse" / "0"
     model.mkdir(parents=True)
-    write_rig(project / "rig_config.json", {"face_000/": (TangentGrid(0, 5), 0)}, {"a.png": "a.jpg"})
+    write_rig(
+        project / "rig_config.json", {"face_000/": (TangentGrid(0, 5), 0)}, {"a.png": "a.jpg"}
+    )
     (model / "cameras.txt").write_text("1 PINHOLE 32 32 30 30 16 16\n")
     (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 face_000/a.png\n\n")
     (model / "points3D.txt").write_text("")
