@@ -116,14 +116,15 @@ PANORAMA = np.zeros((16, 32), np.uint8)
 @pytest.mark.parametrize("wrong", [[[0, 1]], "room.jpg", 5, None], ids=str)
 def test_arguments_of_other_types_are_named(wrong: Any) -> None:
     size, tt = (16, 32), UNTYPED
-    for name, call in {
+    calls: dict[str, Any] = {
         "panorama": lambda: tt.equirect_to_tangent(wrong, GRID),
         "grid": lambda: tt.equirect_to_tangent(PANORAMA, wrong),
         "tangent images": lambda: tt.tangent_to_equirect(wrong, GRID, size),
         "scores": lambda: tt.tangent_to_labels(wrong, GRID, size),
         "function": lambda: tt.apply(wrong, PANORAMA, GRID),
         "path": lambda: tt.load(5 if wrong == "room.jpg" else wrong),
-    }.items():
+    }
+    for name, call in calls.items():
         with pytest.raises(TypeError, match=f"^{name}: found [A-Za-z]+; expected "):
             call()
 

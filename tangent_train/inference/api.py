@@ -75,13 +75,18 @@ _SHOWN = 6
 class ImageSettings(TypedDict, total=False):
     """Arguments of the methods of `Network` besides the image, see `Network.labels`."""
 
-    depth: Depth
     fov: float | None
     area: Sequence[float] | None
     upright: Upright
-    max_tilt_deg: float
     mask: Mask | str | NDArray[Any] | Tensor
     eye: Eye | None
+
+
+class LabelSettings(ImageSettings, total=False):
+    """Arguments that only labels and probabilities need."""
+
+    depth: Depth
+    max_tilt_deg: float
 
 
 @checks_types
@@ -187,10 +192,10 @@ class Network:
         )
 
     @overload
-    def labels(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
+    def labels(self, image: Tensor, **settings: Unpack[LabelSettings]) -> Tensor: ...
     @overload
     def labels(
-        self, image: _Stored, **settings: Unpack[ImageSettings]
+        self, image: _Stored, **settings: Unpack[LabelSettings]
     ) -> NDArray[np.unsignedinteger]: ...
     def labels(
         self,
@@ -273,10 +278,10 @@ class Network:
         return _as_given(_masked(found, given, image, mask, np.nan), image)
 
     @overload
-    def probabilities(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
+    def probabilities(self, image: Tensor, **settings: Unpack[LabelSettings]) -> Tensor: ...
     @overload
     def probabilities(
-        self, image: _Stored, **settings: Unpack[ImageSettings]
+        self, image: _Stored, **settings: Unpack[LabelSettings]
     ) -> NDArray[np.float32]: ...
     def probabilities(self, image: Picture, **settings: Any) -> NDArray[Any] | Tensor:
         """Return the probability of every class at every pixel.

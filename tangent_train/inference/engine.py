@@ -207,7 +207,7 @@ class Predictor:
         loaded: LoadedNetwork,
         head: Head,
         views: ViewSelector,
-        device: str = "cpu",
+        device: str | int | torch.device = "cpu",
         view_batch_size: int | None = None,
     ) -> None:
         if device == "auto":

@@ -305,8 +305,10 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
         tt.load("plain.onnx", views="horizontal_economy").labels(rgb), expected
     )
     assert (tt.load("level.onnx", views="tangent").labels(rgb) != expected).any()
-    both = (tt.load(name, views="tangent").labels(rgb) for name in ("level.onnx", "plain.onnx"))
-    np.testing.assert_array_equal(*both)
+    level, plain = (
+        tt.load(name, views="tangent").labels(rgb) for name in ("level.onnx", "plain.onnx")
+    )
+    np.testing.assert_array_equal(level, plain)
     sizes = {
         "horizontal": (18, (32, 32)),
         "erp": (1, (32, 64)),

@@ -269,7 +269,8 @@ def loaded(trained: LoadedNetwork, monkeypatch: pytest.MonkeyPatch, **settings: 
 def test_files_arrays_and_tensors_get_the_same_depth(network: Network, tmp_path: Path) -> None:
     panorama = far_image(_truth())
     depth = network.depth(panorama)
-    assert (depth.dtype, depth.shape) == (np.float32, SHAPE)
+    assert depth.dtype == np.float32
+    assert depth.shape == SHAPE
     np.testing.assert_allclose(depth, _truth(), atol=0.03)
     Image.fromarray(panorama).save(tmp_path / "room.png")
     np.testing.assert_array_equal(network.depth(tmp_path / "room.png"), depth)

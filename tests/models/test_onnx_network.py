@@ -87,7 +87,7 @@ def test_weights_outside_the_folder_are_refused(tmp_path: Path, location: str, f
     folder = tmp_path / "net"
     folder.mkdir()
     graph = onnx.load(_linear(tmp_path / "whole.onnx"))
-    data = {"location": "out.data", "size_threshold": 0}
+    data: dict[str, Any] = {"location": "out.data", "size_threshold": 0}
     onnx.save(graph, tmp_path / "out.onnx", save_as_external_data=True, **data)
     (folder / "link.data").symlink_to(tmp_path / "out.data")
     graph = onnx.load(tmp_path / "out.onnx", load_external_data=False)

@@ -229,7 +229,7 @@ def test_perspective_images_agree_with_the_textbook(yaw: float, pitch: float, ro
     found = perspective(panorama, yaw, pitch, 70, (40, 30), roll)
     np.testing.assert_allclose(found, expected, atol=1e-9)
     tensor = torch.from_numpy(panorama).movedim(-1, 0)
-    images = perspective(tensor[None], [0, yaw], torch.tensor([0, pitch]), 70, (40, 30), [0, roll])
+    images = perspective(tensor[None], [0, yaw], np.array([0, pitch]), 70, (40, 30), [0, roll])
     assert images.shape == (1, 2, 3, 30, 40)
     assert perspective(tensor[None][:0], [0, 9], size=8).shape == (0, 2, 3, 8, 8)
     np.testing.assert_allclose(images[0, 1].movedim(0, -1), expected, atol=1e-9)
