@@ -32,7 +32,7 @@ GROUPS = (
 GIVEN = {
     "evaluate": [f"checkpoint={CONFIGS}"],
     "export": [f"checkpoint={CONFIGS}", "output=x"],
-    "import": ["output=x"],
+    "import": ["library=onnx", "output=x"],
     "keypoints": ["output=x"],
     "predict": [f"checkpoint={CONFIGS}", "input=x", "output=x"],
 }
