@@ -10,7 +10,7 @@ import numpy as np
 from datamodules.core.label_map import label_doubts
 from tangent_train.cli import main
 from tangent_train.cli.run import open_data
-from tangent_train.config.settings import CheckSettings
+from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.geometry import equirect_solid_angles
@@ -18,7 +18,7 @@ from tangent_train.io.pixel_files import has_warned_of_range
 from tangent_train.results.tables import Table, percent
 
 
-def check(settings: CheckSettings) -> None:
+def check(settings: RunSettings) -> None:
     """Read the whole data set of a run; exit with status 1 if there are problems.
 
     On a terminal, the problems are printed as a table. Elsewhere they are lines of file, finding

@@ -424,16 +424,7 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     """level s, the angular resolution; null = that of the checkpoint"""
 
 
-class CheckSettings(RunSettings):
-    """Settings of tangent-check."""
-
-    not_read: ClassVar[Sequence[str]] = (
-        *("network", "optimizer", "scheduler", "trainer", "logger", "callbacks", "task.head"),
-        *("recipe", "ema", "checkpoint_every_n_steps", "validation_images", "panels"),
-    )
-
-
-class PrepareSettings(CheckSettings):
+class PrepareSettings(RunSettings):
     """Settings of tangent-prepare."""
 
     shard: str | int | None = None
@@ -508,7 +499,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
     "prepare": PrepareSettings,
-    "check": CheckSettings,
+    "check": RunSettings,
 }
 """Settings by the name of the command."""
 

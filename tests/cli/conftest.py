@@ -71,8 +71,7 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Where its rooms are."""
     folder = tmp_path_factory.mktemp("rooms") / "synthetic rooms"
-    read = (text for text in SETTINGS if text.startswith(("experiment", "level", "data", "representation")))
-    run_in(folder.parent, "prepare", *read, f"data.root='{folder}'")
+    run_in(folder.parent, "prepare", *SETTINGS, f"data.root='{folder}'")
     return f"data.root='{folder}'"
 
 

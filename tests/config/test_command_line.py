@@ -115,14 +115,6 @@ def test_an_evaluation_refuses_settings_of_a_training(setting: str, monkeypatch:
         run_command(monkeypatch, "evaluate", "checkpoint=.", "data=synthrooms", setting)
 
 
-@pytest.mark.parametrize("command", ["check", "prepare"])
-def test_unread_settings_of_an_experiment_may_be_set_by_it_alone(
-    command: str, monkeypatch: Patch
-) -> None:
-    with pytest.raises(SystemExit, match=f"optimizer.lr: found a value; .*tangent-{command} does"):
-        run_command(monkeypatch, command, "experiment=rooms/demo", "optimizer.lr=1")
-
-
 @pytest.mark.parametrize("command", ["train", "predict", "report", "import"])
 def test_every_command_prints_the_version(
     command: str, monkeypatch: Patch, capsys: Capture
