@@ -8,7 +8,7 @@ from typing import Any
 from tangent_train.config.settings import PredictSettings, RenderSettings, Settings
 from tangent_train.errors import SettingError
 from tangent_train.files import check_new
-from tangent_train.io.inputs import input_paths
+from tangent_train.io.image_files import input_paths
 from tangent_train.manifest import check_continues
 
 _STORED_OTHERWISE = ("checkpoint", "level", "write")

@@ -8,11 +8,13 @@ import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path, PurePath
 
 from PIL import Image
 
 from tangent_train.errors import DataError
+from tangent_train.manifest import MANIFEST
 
 with suppress(ImportError):  # the extra `heif`
     import pillow_heif
@@ -29,6 +31,9 @@ IMAGE_SUFFIXES = tuple(
     )
 )
 """Suffixes of images, in lower case."""
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+"""Suffixes of videos, in lower case."""
 
 HEIF_SUFFIXES = (".heic", ".heics", ".heif", ".heifs", ".hif")
 """Suffixes of HEIF images, which are read with the extra ``heif``."""
@@ -103,6 +108,20 @@ def image_paths(
     if skipped:
         tell(f"Skipped: {kinds}. {_CONVERT}")
     return images
+
+
+def input_paths(
+    pattern: str | Path, tell: Callable[[str], object] = lambda text: None
+) -> list[Path]:
+    """List the images and videos that a command reads, without opening them, see `image_paths`."""
+
+    @cache
+    def is_written(folder: Path) -> bool:
+        inside = Path(pattern) in folder.parents
+        return inside and ((folder / MANIFEST).exists() or is_written(folder.parent))
+
+    suffixes = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
+    return image_paths(pattern, suffixes, lambda path: is_written(path.parent), tell)
 
 
 def is_wanted(path: Path, folder: Path = Path()) -> bool:

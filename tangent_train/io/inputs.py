@@ -5,22 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.io.gpano import Eye, eye_part, shape_of
-from tangent_train.io.image_files import IMAGE_SUFFIXES, image_paths, short_names
+from tangent_train.io.image_files import VIDEO_SUFFIXES, input_paths, short_names
 from tangent_train.io.videos import (
-    VIDEO_SUFFIXES,
     Frame,
     read_frames,
     read_video_size,
     read_video_tags,
 )
-from tangent_train.manifest import MANIFEST
 from tangent_train.progress import progress_bar
 from tangent_train.threads import in_threads
 
@@ -78,20 +76,6 @@ class Video:
     size: tuple[int, int, int]
     frames: dict[str, int]
     part: tuple[slice, slice]
-
-
-def input_paths(
-    pattern: str | Path, tell: Callable[[str], object] = lambda text: None
-) -> list[Path]:
-    """List the images and videos of `Inputs.find` without opening them, see `image_paths`."""
-
-    @cache
-    def is_written(folder: Path) -> bool:
-        inside = Path(pattern) in folder.parents
-        return inside and ((folder / MANIFEST).exists() or is_written(folder.parent))
-
-    suffixes = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
-    return image_paths(pattern, suffixes, lambda path: is_written(path.parent), tell)
 
 
 @dataclass(frozen=True)

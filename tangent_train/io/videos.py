@@ -17,9 +17,6 @@ from tangent_train.files import atomic_path, checked_file
 from tangent_train.io.gpano import PART_TAGS
 from tangent_train.threads import in_threads
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
-"""Suffixes of videos, in lower case."""
-
 _READERS = "mov,matroska,avi"
 """FFmpeg's demuxers of these formats. Other demuxers read playlists, scripts and further files."""
 

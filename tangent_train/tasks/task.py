@@ -156,9 +156,9 @@ class Task(lightning.LightningModule, ABC):
     def on_train_start(self) -> None:
         """Log at least once per epoch, and once per training, however few steps it has."""
         trainer: Any = self.trainer
-        per_epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+        per_epoch = trainer.num_training_batches / trainer.accumulate_grad_batches  # may be inf
         every = min(trainer.log_every_n_steps, per_epoch, trainer.estimated_stepping_batches)
-        trainer.log_every_n_steps = int(every)
+        trainer.log_every_n_steps = math.ceil(every)
 
     def setup(self, stage: str) -> None:
         """Take settings of the loss from the data before training; a checkpoint contains them."""
