@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +73,7 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     assert len(set(names[0])) == 2
 
     (tmp_path / "cut_short.py").write_text(CUT_SHORT)
-    _train(tmp_path, *two, "hydra.run.dir=cut", status=143, program="cut_short.py")
+    _train(tmp_path, *two, "hydra.run.dir=cut", status=128 + signal.SIGHUP, program="cut_short.py")
     _train(tmp_path, f"resume={tmp_path / 'cut'}")
     assert results(tmp_path / "cut") == results(tmp_path / "two")
     checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
