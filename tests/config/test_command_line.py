@@ -37,7 +37,6 @@ def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
         ("train model=unet", "Did you mean network?"),
         ("predict +level=5", "Did you mean levels?"),
         ("train save_dir=x", "Did you mean hydra.run.dir?"),
-        ("prepare save_dir=x", "expected a known setting."),
         ("train --checkpoint x", "--checkpoint: found an option; .*mean resume or init_from?"),
         ("train --config x.yaml", "Did you mean experiment?"),
         ("predict net.onnx in out", "mean checkpoint=net.onnx input=in output=out?"),
