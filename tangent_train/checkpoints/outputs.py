@@ -13,6 +13,7 @@ from torch.nn import functional
 from models.distortion_aware import make_distortion_aware
 from tangent_train.errors import SettingError, width_height
 from tangent_train.kinds import ScoreKind
+from tangent_train.rendering.mosaic import without_softmax
 
 _MAP = 3
 """Number of dimensions of labels or depth without an axis of channels."""
@@ -174,7 +175,7 @@ def _mean_of_tiles(
         scores = network(images[area])
         if not total.ndim:
             total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
-        known = scores.amax(dim=1, keepdim=True).isfinite()
+        known = ~without_softmax(scores)
         total[area] += scores.where(known, 0)
         count[area] += known
     return total / count

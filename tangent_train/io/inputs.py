@@ -35,7 +35,7 @@ class Job:
         path: File of the image or video.
         value: Input of the next step, at first the function that decodes a frame, or None; after
             the last step, the result.
-        place: Of a frame: its number in the video, and its time in seconds once it is decoded.
+        place: Number of a frame in its video, and its time in seconds once it is decoded.
         error: Message of a failed step; empty if all succeeded.
     """
 

@@ -1,4 +1,4 @@
-"""What is typed: interpolations, words of other programs, hints, and the version."""
+"""Words of a command line: interpolations, names of other programs, hints, and the version."""
 
 from __future__ import annotations
 
