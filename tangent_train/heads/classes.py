@@ -33,7 +33,7 @@ from tangent_train.metrics.scores import (
 )
 from tangent_train.metrics.segmentation import AbsentClass, SegmentationCounts
 from tangent_train.rendering import Blend
-from tangent_train.rendering.mosaic import ScoreMosaic, without_softmax
+from tangent_train.rendering.mosaic import ScoreMosaic
 
 _ROWS_AT_ONCE = 64
 _BINS = 256
@@ -173,9 +173,9 @@ class ClassesHead(Head):
         return mosaic
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
-        """Return the labels of the largest logits; 0 where they have no softmax."""
-        known = ~without_softmax(outputs)[:, 0]
-        return self.labels_of(outputs.argmax(dim=1).where(known, self.num_outputs))
+        """Return the labels of the largest logits; 0 where a logit is NaN or infinite."""
+        highest, best = outputs.max(dim=1)
+        return self.labels_of(best.where(highest.isfinite(), self.num_outputs))
 
     def labels_of(self, best: Tensor) -> Tensor:
         """Return the labels of outputs: 0 where the best one belongs to none of the K classes."""
@@ -296,8 +296,9 @@ class LabelMosaic(ScoreMosaic):
 
     @property
     def facts(self) -> Mapping[str, float]:
-        """The share of pixels of views without a class, see `ScoreMosaic.add`, if there are any."""
-        return {"not_finite": self.not_finite} if self.not_finite else NOTHING
+        """The share of pixels without a class, see `ScoreMosaic.not_finite`, if there are any."""
+        share = self.not_finite
+        return {"not_finite": share} if share else NOTHING
 
     def pixels(self) -> Tensor:
         """Return labels ``(H, W)``, 0 where unknown."""

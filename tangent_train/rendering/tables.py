@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from functools import lru_cache
 from os import register_at_fork
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
@@ -87,18 +88,21 @@ def _nbytes(table: tuple[Any, ...]) -> int:
     return sum(part.nbytes for part in table)
 
 
-TABLES = TableCache(limit=512 * 2**20)
+TABLES = TableCache(limit=2**30)
 _ROTATED_SHARE = 16
 _ROTATED = TableCache(limit=TABLES.limit // _ROTATED_SHARE)
 """Tables of rotated grids, reused for depth and labels after RGB. They have a separate cache,
 because random rotations would evict all other tables."""
 
+_DEVICE_SHARE = 8
+"""Tables on a GPU take at most an eighth of its memory."""
+
 
 def set_table_cache_limit(nbytes: int) -> None:
-    """Limit the memory of the rendering tables of this process; the default is 512 MiB.
+    """Limit the memory of the rendering tables of this process; the default is 1 GiB.
 
-    At level 10 and base level 1 the tables take 168 MB from panorama to images and, for tensors,
-    117 MB back. Tables on a GPU count too. Tables of rotated grids may use another sixteenth.
+    At level 10 and base level 1 the tables take 168 MB from panorama to images. Tables of rotated
+    grids may use another sixteenth, and tables on a GPU an eighth of its memory.
 
     Args:
         nbytes: Maximum number of bytes in the cache; 0 disables it.
@@ -112,13 +116,34 @@ def set_table_cache_limit(nbytes: int) -> None:
     _ROTATED.set_limit(nbytes // _ROTATED_SHARE)
 
 
-def cached(key: Hashable, build: Callable[[], Value], *, is_rotated: bool) -> Value:
-    """Return the table of a key from one of the two caches, see `TableCache.get`."""
+@lru_cache
+def _tables_on(device: torch.device) -> TableCache:
+    """Return the cache of tables on a device other than the CPU."""
+    if device.type == "cuda" and torch.cuda.is_available():
+        return TableCache(torch.cuda.get_device_properties(device).total_memory // _DEVICE_SHARE)
+    return TableCache(TABLES.limit)
+
+
+def cached(
+    key: Hashable,
+    build: Callable[[], Value],
+    *,
+    is_rotated: bool = False,
+    device: torch.device | None = None,
+) -> Value:
+    """Return the table of a key from the cache of its device, see `TableCache.get`."""
+    if device is not None and device.type != "cpu":
+        return _tables_on(device).get(key, build)
     return (_ROTATED if is_rotated else TABLES).get(key, build)
 
 
-def _cached(grid: PinholeGrid, key: tuple[Hashable, ...], build: Callable[[], Value]) -> Value:
-    return cached((grid, *key), build, is_rotated=grid.rotation is not None)
+def _cached(
+    grid: PinholeGrid,
+    key: tuple[Hashable, ...],
+    build: Callable[[], Value],
+    device: torch.device | None = None,
+) -> Value:
+    return cached((grid, *key), build, is_rotated=grid.rotation is not None, device=device)
 
 
 def forward_map(
