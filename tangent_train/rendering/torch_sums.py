@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 _ENTRIES_AT_ONCE = 2**25
 """Largest number of entries of a matrix, 256 MiB; a canvas with more is divided by rows."""
 
-_SCORES_AT_ONCE = 2**28
-"""Number of sums that are held at once if only labels are kept, 1 GiB."""
+_SCORES_AT_ONCE = 2**29
+"""Number of sums that are held at once if only labels are kept, 2 GiB."""
 
 _PIXELS_AT_ONCE = 2**21
 """Number of pixels whose positions are computed at once."""
