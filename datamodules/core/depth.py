@@ -47,7 +47,7 @@ def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
     return np.where(steps == 0, np.float32(np.nan), meters)
 
 
-def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+def meters_to_steps(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
     """Convert depth in meters to steps of 1/512 m, rounded, at most 65535 (128 m).
 
     Depth below half a step is rounded up to one step: 0 means missing.
@@ -57,17 +57,6 @@ def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     """
     steps = np.minimum(depth_m * np.float32(STEPS_PER_M) + np.float32(0.5), MOST_STEPS)
     return np.maximum(steps.astype(np.uint16), depth_m > 0)
-
-
-def units_to_steps(stored: NDArray[np.uint16], units_per_m: int) -> NDArray[np.uint16]:
-    """Convert 16-bit depth in integer units to steps of 1/512 m, see `meters_to_steps`.
-
-    >>> units_to_steps(np.array([0, 1, 4000, 65535], np.uint16), 4000).tolist()
-    [0, 1, 512, 8388]
-    """
-    # In integers, because float32 would round some values of 16 bits to the wrong step.
-    steps = (stored.astype(np.int64) * 2 * STEPS_PER_M + units_per_m) // (2 * units_per_m)
-    return np.maximum(np.minimum(steps, MOST_STEPS).astype(np.uint16), stored > 0)
 
 
 def distance_from_z_depth(

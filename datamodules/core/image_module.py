@@ -20,8 +20,8 @@ from datamodules.core.depth import (
     MOST_STEPS,
     STEPS_PER_M,
     distance_from_z_depth,
+    meters_to_steps,
     resize_depth,
-    units_to_steps,
 )
 from datamodules.core.files import ImageFiles, Split
 from datamodules.core.inputs import (
@@ -46,7 +46,7 @@ from tangent_train.io.gpano import (
     read_up,
 )
 from tangent_train.io.masks import Masks
-from tangent_train.io.pixel_files import read_image_size, read_pixels, read_rgb
+from tangent_train.io.pixel_files import read_depth_m, read_image_size, read_rgb
 from tangent_train.kinds import Upright
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.orientation.manhattan import MOST_ROWS
@@ -172,12 +172,9 @@ class ImageDataModule(DataModule):
         return labels
 
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Return depth in steps of 1/512 m, 0 where missing."""
+        """Return depth in steps of 1/512 m, 0 where missing; see `read_depth_m`."""
         path: Any = files.depth
-        stored = read_pixels(path, indices=True)
-        if stored.dtype != np.uint16 or stored.ndim > 2:
-            raise DataError(path, found=f"{stored.dtype} {stored.shape}", expected="16-bit gray")
-        return units_to_steps(stored, self.units_per_m)
+        return meters_to_steps(read_depth_m(path, self.units_per_m))
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64] | None:
         """Return ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama."""

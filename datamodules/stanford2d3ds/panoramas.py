@@ -37,9 +37,9 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import Rotation
 
 from datamodules.core.data_module import data_set
-from datamodules.core.depth import STEPS_PER_M, meters_to_steps
 from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.label_map import LabelMap
@@ -48,7 +48,6 @@ from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.image_files import glob_files
-from tangent_train.io.pixel_files import read_depth_m
 
 GET_IT = (
     "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
@@ -198,10 +197,6 @@ class StanfordImages(ImageDataModule):
         path: Any = files.labels
         return self._label_table.read_labels(path)
 
-    def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """See `ImageDataModule`."""
-        return read_depth(files.depth)
-
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
         """See `ImageDataModule`: by the pose file, if there is one."""
         path = sibling(files.rgb, "pose.json")
@@ -237,15 +232,6 @@ class Stanford2D3DSPerspective(StanfordImages, PhotoDataModule):
         return _CENTERS_FROM_CORNERS @ matrix
 
 
-def read_depth(path: Any) -> NDArray[np.uint16]:
-    """Read depth in steps of 1/512 m, 0 where missing.
-
-    Raises:
-        DataError: The file is broken, or holds no depth.
-    """
-    return meters_to_steps(read_depth_m(path, STEPS_PER_M))
-
-
 class _PoseRecord(BaseModel):
     """Numbers of a pose file; some releases have a fourth row 0 0 0 1."""
 
@@ -275,7 +261,7 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
     angles = np.array(record.camera_original_rotation)
     if np.abs(angles).max() > 2 * math.pi:
         angles = np.radians(angles)
-    original = stanford.euler_rotation(angles)
+    original = Rotation.from_euler("xyz", angles).as_matrix()
     rotation = np.array(record.camera_rt_matrix)[:3, :3]
     world_from_panorama = original @ rotation @ original @ stanford.CAMERA_FROM_SPHERE
     return PanoramaPose(world_from_panorama, record.camera_location)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.depth import units_to_steps
+from datamodules.core.depth import meters_to_steps
 from datamodules.core.files import ImageFiles, Problems, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import RGBD_NORMALIZATION, Input, Normalization
@@ -73,7 +73,6 @@ class SynthiaSequences(ImageDataModule):
 
     label_maps: ClassVar[Mapping[str, LabelMap]] = {"13": _LABELS}
     normalizations = _NORMALIZATIONS
-    units_per_m = 100
     get_it = reader.GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
 
@@ -118,7 +117,7 @@ class SynthiaSequences(ImageDataModule):
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`: centimeters in the first channel."""
         path: Any = files.depth
-        return units_to_steps(reader.read_first_channel(path), self.units_per_m)
+        return meters_to_steps(reader.read_first_channel(path) / np.float32(100))
 
 
 @data_set

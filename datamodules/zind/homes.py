@@ -93,7 +93,7 @@ class HomePanorama(NamedTuple):
         return self.file.parent.name
 
     @property
-    def image(self) -> Path:
+    def rgb(self) -> Path:
         """Path of the picture."""
         return self.file.parent / self.record.image_path
 

@@ -219,7 +219,7 @@ class Head(nn.Module, ABC):
         Returns:
             An object with ``add(outputs, views)``, which adds the outputs ``(n, C, h, w)`` of some
             views, ``pixels()``, which returns the prediction ``(H, W)``, and ``facts`` about it.
-            ``not_finite`` is the share of pixels whose outputs are NaN or infinite.
+            ``not_finite`` is the share of the pixels whose outputs are NaN or infinite.
         """
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Any:

@@ -14,7 +14,6 @@ from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,
     Stanford2D3DSPerspective,
-    read_depth,
     read_label_table,
 )
 from tangent_train.errors import DataError
@@ -136,13 +135,6 @@ def test_a_photo_is_what_the_files_hold(photo_root: Path) -> None:
     np.testing.assert_allclose(
         photo.camera_matrix, camera_matrix_from_fov(62, (32, 32)), err_msg="counted from centers"
     )
-
-
-def test_depth_of_8_bits_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "depth.png"
-    write_png(path, np.full((4, 8), 200, np.uint8))
-    with pytest.raises(DataError, match=r"found uint8 of shape .*expected depth"):
-        read_depth(path)
 
 
 def test_distances_saturate_and_holes_stay_holes() -> None:
