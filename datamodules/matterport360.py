@@ -32,7 +32,6 @@ from typing import ClassVar, Literal
 from datamodules.core.data_module import data_set
 from datamodules.core.files import SPLITS, ImageFiles, Split
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.tables import read_table
 from tangent_train.io.image_files import glob_files
@@ -97,7 +96,6 @@ class Matterport360(PanoramaDataModule):
     )
     fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
 
-    inputs: Sequence[Input] = ("rgb",)
     release: Literal["360fv", "sfss"] = "360fv"
     test_split: Literal["test", "val"] = "test"  # type: ignore[misc]
 

@@ -33,7 +33,6 @@ from datamodules.cityscapes import THIRTEEN
 from datamodules.core.data_module import data_set
 from datamodules.core.files import SPLITS, ImageFiles, Split
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from tangent_train.io.image_files import glob_files
 
@@ -80,7 +79,6 @@ class SynPASS(PanoramaDataModule):
     )
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
-    inputs: Sequence[Input] = ("rgb",)
     weather: Literal["all"] | Weather | Annotated[Sequence[Weather], Field(min_length=1)] = "all"
     time: Literal["all", "day", "night"] = "all"
     test_split: Literal["test", "val"] = "test"  # type: ignore[misc]

@@ -185,6 +185,7 @@ class ModelNet40(DataModule):
     get_it = _GET_IT
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
+    cache_settings = ("erp_height",)
 
     batch_size: PositiveInt = 16
     test_rotation: Literal["yaw", "so3"] | None = None
@@ -220,10 +221,6 @@ class ModelNet40(DataModule):
         shape = self.erp_height, 2 * self.erp_height
         values = mesh_spheres(read_mesh(files.path), shape)
         return Spheres(np.rint(values * STEPS).astype(np.uint16))
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        return {**super().decode_settings(), "height": self.erp_height}
 
     def in_parallel(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Generator[Any]:
         """See `DataModule`: in processes, because reading meshes holds the GIL."""
