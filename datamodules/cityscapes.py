@@ -88,10 +88,7 @@ class Cityscapes(PhotoDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, _IDS, strict=True)), _UNKNOWN))
     no_depth = "disparities are not read"
-    get_it = (
-        "Get leftImg8bit, gtFine and camera (…_trainvaltest.zip) from "
-        "https://www.cityscapes-dataset.com and point data.root at the folder that holds them."
-    )
+    get_it = "Get leftImg8bit, gtFine and camera from https://www.cityscapes-dataset.com."
     test_split = "val"
     cache_settings = ("fov",)
 

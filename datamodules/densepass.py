@@ -49,10 +49,7 @@ class DensePASS(PanoramaDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, range(19), strict=True)), [255]))
     no_depth = "DensePASS has no depth images"
-    get_it = (
-        "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the "
-        "folder with leftImg8bit and gtFine."
-    )
+    get_it = "Get DensePASS from https://github.com/chma1024/DensePASS."
 
     horizon_row: Annotated[float, Field(ge=0, le=_HEIGHT)] = _HEIGHT / 2
 

@@ -89,10 +89,8 @@ class Matterport360(PanoramaDataModule):
     }
     units_per_m = 4000
     get_it = (
-        "Request Matterport3D at https://niessner.github.io/Matterport and its panoramas from "
-        "360BEV (https://github.com/jamycheung/360BEV) or SFSS-MMSI "
-        "(https://github.com/sguttikon/SFSS-MMSI), and point data.root at the folder of the "
-        "scenes."
+        "Request Matterport3D at https://niessner.github.io/Matterport, and its panoramas from "
+        "https://github.com/jamycheung/360BEV or https://github.com/sguttikon/SFSS-MMSI."
     )
     fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
 

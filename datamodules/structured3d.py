@@ -102,10 +102,7 @@ class Structured3DImages(ImageDataModule):
         "published_s3d8": PublishedS3D8(_EIGHT.names, _EIGHT.labels),
     }
     units_per_m = 1000
-    get_it = (
-        "Request Structured3D at https://structured3d-dataset.org and point data.root at the "
-        "folder with scene_00000 and the others."
-    )
+    get_it = "Request Structured3D at https://structured3d-dataset.org."
     place: ClassVar[str]
     fact_settings: ClassVar[tuple[str, ...]] = (
         *("configuration", "lighting", "invalid_scenes", "test_split"),

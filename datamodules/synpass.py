@@ -73,10 +73,7 @@ class SynPASS(PanoramaDataModule):
         "13": _TWENTY_TWO.regrouped(THIRTEEN, _MERGED),
     }
     no_depth = "SynPASS has no depth images"
-    get_it = (
-        "Get SynPASS as https://github.com/jamycheung/Trans4PASS describes and point data.root at"
-        " the folder with img and semantic."
-    )
+    get_it = "Get SynPASS from https://github.com/jamycheung/Trans4PASS."
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
     weather: Literal["all"] | Weather | Annotated[Sequence[Weather], Field(min_length=1)] = "all"

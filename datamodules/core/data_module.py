@@ -299,7 +299,7 @@ class DataModule(LightningDataModule, ABC):
                     self.root,
                     found=f"no {self.noun}" if self.root.is_dir() else "no such folder",
                     expected=f"{self.noun}, as docs and the docstring of the data set describe",
-                    remedy=self.get_it,
+                    remedy=f"Name its folder in data.root. {self.get_it}".rstrip(),
                 )
         self._test_images = self.problems.incomplete.get(self.test_split, "")
         if self.test_split == "val":

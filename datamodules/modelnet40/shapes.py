@@ -62,10 +62,6 @@ coarse around 1, and OpenCV does not sample it.
 """
 
 _PER_PROCESS = 40
-_GET_IT = (
-    "Get ModelNet40.zip from https://modelnet.cs.princeton.edu and name the unpacked folder in "
-    "data.root. Or choose data=synthshapes, which needs no download."
-)
 
 
 class ShapeFile(NamedTuple):
@@ -182,7 +178,7 @@ class ModelNet40(DataModule):
     kind = Spheres
     samples = ShapeDataset
     default_level = 5
-    get_it = _GET_IT
+    get_it = "Get it from https://modelnet.cs.princeton.edu, or choose data=synthshapes."
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
     cache_settings = ("erp_height",)

@@ -50,10 +50,7 @@ from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.image_files import glob_files
 
-GET_IT = (
-    "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
-    "the folder with area_1 … area_6, or train on data=synthrooms, which needs no download."
-)
+GET_IT = "Get Stanford2D3DS from http://buildingparser.stanford.edu, or choose data=synthrooms."
 """Remedy if the data set is missing."""
 
 _NAME = re.compile(
