@@ -13,7 +13,6 @@ from torch.nn import functional
 from models.distortion_aware import make_distortion_aware
 from tangent_train.errors import SettingError, width_height
 from tangent_train.kinds import ScoreKind
-from tangent_train.rendering.mosaic import without_softmax
 
 _MAP = 3
 """Number of dimensions of labels or depth without an axis of channels."""
@@ -161,10 +160,7 @@ def _resized(images: Tensor, size: Any) -> Tensor:
 def _mean_of_tiles(
     network: Callable[[Tensor], Tensor], images: Tensor, tile: tuple[int, int]
 ) -> Tensor:
-    """Return the mean scores of evenly spaced tiles that cover larger images.
-
-    Pixels without a softmax do not count in the mean; they are NaN if there are no others.
-    """
+    """Return the mean scores of evenly spaced tiles that cover larger images."""
     tops, lefts = (
         torch.linspace(0, side - part, -(-side // part)).round().int().tolist()
         for side, part in zip(images.shape[-2:], tile, strict=True)
@@ -175,7 +171,6 @@ def _mean_of_tiles(
         scores = network(images[area])
         if not total.ndim:
             total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
-        known = ~without_softmax(scores)
-        total[area] += scores.where(known, 0)
-        count[area] += known
+        total[area] += scores
+        count[area] += 1
     return total / count

@@ -45,6 +45,10 @@ _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _LN_2, _LOG2_E = np.float32(math.log(2)), np.float32(1 / math.log(2))
 _C3, _C4, _C5, _C6 = np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120), np.float32(1 / 720)
 _FLUSHED = np.float32(-40)
+_NEVER = np.float32(-1e30)
+"""Stands for a score of minus infinity, whose product with a weight of 0 would be NaN."""
+_LOWEST = np.float32(-1e20)
+"""Scores below it are weighted sums with `_NEVER`."""
 
 Array = NDArray[Any]
 Tile = tuple[int, int, int, int]
@@ -381,9 +385,10 @@ def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
     """Compute the softmax over the classes in place, except for a factor per pixel.
 
     Args:
-        lines: ``(K, n)`` scores, changed; NaN gets a probability of 0.
+        lines: ``(K, n)`` scores, changed.
         highest: ``(n,)`` buffer.
-        factor: ``(n,)`` factors with which the probabilities add up to 1, written.
+        factor: ``(n,)`` factors with which the probabilities add up to 1, written; NaN where a
+            score is NaN or infinite, or all are minus infinity.
     """
     pixels = np.uint64(len(factor))
     highest[:], factor[:] = -np.inf, 0
@@ -391,13 +396,23 @@ def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
         line = lines[k]
         for x in range(pixels):
             highest[x] = line[x] if line[x] > highest[x] else highest[x]
+            factor[x] += line[x]
+    for x in range(pixels):
+        highest[x] = highest[x] if factor[x] < np.inf and highest[x] > _LOWEST else np.nan
+    factor[:] = 0
     for k in range(len(lines)):
         line = lines[k]
         for x in range(pixels):
             line[x] = _exp(line[x] - highest[x])
             factor[x] += line[x]
     for x in range(pixels):
-        factor[x] = _ONE / factor[x] if factor[x] > 0 else _ZERO
+        factor[x] = _ONE / factor[x] if factor[x] > 0 else np.nan
+
+
+@njit_fast
+def _bounded(score: np.float32) -> np.float32:
+    """Return the score, or `_NEVER` for minus infinity."""
+    return _NEVER if score < _NEVER else score
 
 
 @njit_fast
@@ -419,7 +434,7 @@ def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array)
         for k in range(num_classes):
             line, source = lines[k], scores[k, top + y]
             for x in range(np.uint64(width)):
-                line[x] = source[np.uint64(left) + x]
+                line[x] = _bounded(source[np.uint64(left) + x])
         if softmax:
             _softmax_lines(lines, highest, factor)
         for k in range(np.uint64(num_classes)):
@@ -515,24 +530,25 @@ def _tiles(start: int, stop: int, canvas: CanvasGeometry, pixels: int) -> list[T
 def _write_classes(
     sums: Array, num_classes: int, least: float, floor: float, labels: Array
 ) -> None:
-    """Write the class of the largest sum of each pixel in a row; the first of equal ones, no NaN.
+    """Write the class of the largest sum of each pixel in a row; the first of equal ones.
 
     Args:
         sums: ``(w, Kp)`` sums.
         num_classes: K.
         least: Share of the sum of all classes that the largest must reach, else the class is K.
         floor: Number that the largest sum must exceed, else the class is K.
-        labels: ``(w,)`` class indices, written.
+        labels: ``(w,)`` class indices, written; K where a sum is NaN or infinite.
     """
     for x in range(len(labels)):
-        highest, best = np.float32(-np.inf), np.int32(0)
+        highest, best, total = np.float32(-np.inf), np.int32(0), _ZERO
         for k in range(np.uint64(num_classes)):
             score = sums[x, k]
             # Arithmetic, because a condition compiles to a branch, which is slow at class borders.
             best += (np.int32(k) - best) * np.int32(score > highest)
             highest = score if score > highest else highest
-        unsure = least > 0 and highest < least * sums[x, :num_classes].sum()
-        labels[x] = best if highest > floor and not unsure else num_classes
+            total += score
+        sure = highest > floor and total < np.inf and (least <= 0 or highest >= least * total)
+        labels[x] = best if sure else num_classes
 
 
 @njit_fast
@@ -637,12 +653,13 @@ def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Arra
         left: First column of the part.
         top: First row of the part.
         highest: ``(width,)`` buffer.
-        best: ``(height, width)`` class indices, written; −1 where the largest score is infinite or
-            all scores are NaN.
+        best: ``(height, width)`` class indices, written; −1 where a score is NaN or infinite, or
+            all are minus infinity.
     """
     width = best.shape[1]
+    total = np.empty(width, np.float32)
     for y in range(len(best)):
-        highest[:], of_row = -np.inf, best[y]
+        highest[:], total[:], of_row = -np.inf, 0, best[y]
         of_row[:] = 0
         # Two classes at once halve the writes; the last of an odd number is compared twice.
         for k in range(0, len(scores), 2):
@@ -655,18 +672,17 @@ def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Arra
                 most = score if better else highest[x]
                 of_row[x] = np.int32(after) if other > most else label
                 highest[x] = other if other > most else most
+                total[x] += score + other
         for x in range(np.uint64(width)):
-            finite = -np.inf < highest[x] < np.inf
-            of_row[x] = of_row[x] if finite else -1
+            is_known = highest[x] > _LOWEST and total[x] < np.inf
+            of_row[x] = of_row[x] if is_known else -1
 
 
 @njit_fast
 def _interpolated_classes(
     scores: Array, count: int, buffers: _TileBuffers, highest: Array, best: Array
 ) -> None:
-    """Write classes of the largest interpolated scores; the first of equal ones, no NaN.
-
-    The class is K where all scores are NaN or minus infinity.
+    """Write classes of the largest interpolated scores; the first of equal ones.
 
     Args:
         scores: ``(K, h, w)`` scores of an image.
@@ -681,8 +697,9 @@ def _interpolated_classes(
         plane, label = scores[k].reshape(-1), np.int32(k)
         for p in range(np.uint64(count)):
             at = np.uint64(buffers.first[p])
-            score = buffers.a[p] * plane[at] + buffers.b[p] * plane[at + right]
-            score += buffers.c[p] * plane[at + below] + buffers.d[p] * plane[at + below + right]
+            c, d = _bounded(plane[at + below]), _bounded(plane[at + below + right])
+            score = buffers.a[p] * _bounded(plane[at]) + buffers.b[p] * _bounded(plane[at + right])
+            score += buffers.c[p] * c + buffers.d[p] * d
             better = score > highest[p]
             best[p] = label if better else best[p]
             highest[p] = score if better else highest[p]
@@ -690,13 +707,14 @@ def _interpolated_classes(
 
 @njit_fast
 def _write_alike(
-    n: int, best: Array, corner: tuple[int, int], buffers: _TileBuffers, labels: Array
+    n: int, best: Array, corner: tuple[int, int], unknown: int, buffers: _TileBuffers, labels: Array
 ) -> int:
     """Write labels of pixels between four pixels of the image with the same best class.
 
     Args:
         n: Number of pixels.
         best: Best classes of a part of the image, from `_best_of_part`.
+        unknown: Label of pixels of which one of the four has no class.
         corner: Row and column of the part in the image.
         buffers: The pixels; remaining pixels are moved to the front.
         labels: Labels of the canvas, flat, written.
@@ -708,9 +726,10 @@ def _write_alike(
     remaining, right = 0, np.uint64(1)
     for p in range(n):
         at = np.uint64((buffers.row[p] - corner[0]) * best.shape[1] + buffers.column[p] - corner[1])
-        label = flat[at]
-        if label == flat[at + right] == flat[at + below] == flat[at + below + right] >= 0:
-            labels[buffers.pixel[p]] = label
+        a, b, c, d = flat[at], flat[at + right], flat[at + below], flat[at + below + right]
+        is_known = min(a, b, c, d) >= 0
+        if a == b == c == d or not is_known:
+            labels[buffers.pixel[p]] = a if is_known else unknown
             continue
         buffers.pixel[remaining] = buffers.pixel[p]
         buffers.column[remaining], buffers.row[remaining] = buffers.column[p], buffers.row[p]
@@ -749,7 +768,7 @@ def label_images(
             best = _at_least(best, high * wide)
             part = best[: high * wide].reshape((high, wide))
             _best_of_part(scores[m], left, top, highest[:wide], part)
-            n = _write_alike(n, part, (top, left), buffers, flat)
+            n = _write_alike(n, part, (top, left), scores.shape[1], buffers, flat)
             _weigh(n, (side[1], 0), buffers)
             _interpolated_classes(scores[m], n, buffers, highest, unlike)
             for p in range(n):

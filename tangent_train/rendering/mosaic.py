@@ -9,6 +9,7 @@ backends with the same results: compiled kernels on the CPU (`numba_sums`), and 
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
 
 _LEAST_TOTAL = 1e-37
 _PIXELS_AT_ONCE = 1 << 17
-_NEVER = -1e30
 
 _LEAST_VALID = {"nearest": 0.5, "feather": 1e-3}
 """Least weight of the valid images at a pixel; of a single image, feather weights are 0 to 1."""
@@ -158,37 +158,27 @@ class ScoreMosaic(Mosaic):
             spare=spare,
         )
         self._min_confidence = min_confidence
-        self._unknown: Any = 0
-        self._pixels = 0
-
-    def add(self, values: Tensor, views: Views) -> None:
-        """Add some views of a set; pixels without a softmax do not count, see `without_softmax`."""
-        if not values.is_cpu or not values.sum().isfinite():  # a GPU is not waited for
-            unknown = without_softmax(values)
-            values = values.masked_fill(unknown, torch.nan)
-            self._unknown += unknown.count_nonzero()
-        self._pixels += values[:, 0].numel()
-        super().add(values, views)
 
     @property
-    def not_finite(self) -> float:
-        """Share of the pixels of all views that do not count, see `add`."""
-        return float(self._unknown) / max(1, self._pixels)
+    def not_finite(self) -> Tensor:
+        """Share of the pixels at which a view has a score that is NaN or infinite."""
+        return self._backend.unknown() / math.prod(self.shape)
 
     def labels(self) -> Tensor:
         """Return ``(H, W)`` indices of the best classes (the first of equals).
 
-        They are K where the confidence is too low, and where no view has a softmax.
+        They are K where the confidence is too low, and where a view has no softmax because a score
+        is NaN or infinite. The scores of networks in half precision overflow beyond 65504.
         """
         return self._backend.labels(self._min_confidence)
 
     def probabilities(self, rows: slice | NDArray[np.intp]) -> Tensor:
         """Return ``(h, W, K)`` probabilities of some rows; needs `averaged`.
 
-        They add up to 1; all are 0 where no view has a softmax.
+        They add up to 1; all are 0 where a view has no softmax.
         """
         total = self._backend.rows(rows)
-        return total / total.sum(dim=-1, keepdim=True).clamp(min=_LEAST_TOTAL)
+        return (total / total.sum(dim=-1, keepdim=True).clamp(min=_LEAST_TOTAL)).nan_to_num_(0.0)
 
     def confidences(self) -> NDArray[np.float32]:
         """Return the ``(H, W)`` probabilities of the best classes; needs `averaged`."""
@@ -196,15 +186,6 @@ class ScoreMosaic(Mosaic):
         starts = range(0, self.shape[0], step)
         parts = [self.probabilities(slice(top, top + step)).amax(dim=-1) for top in starts]
         return torch.cat(parts).cpu().numpy()
-
-
-def without_softmax(scores: Tensor) -> Tensor:
-    """Return ``(n, 1, h, w)``, True where scores ``(n, K, h, w)`` have no softmax.
-
-    There the largest is not finite: a score is NaN or infinite, or all are minus infinity. The
-    scores of networks in half precision overflow beyond 65504.
-    """
-    return ~scores.amax(dim=1, keepdim=True).isfinite()
 
 
 class MeanMosaic(Mosaic):
@@ -331,8 +312,8 @@ def tangent_to_labels(
             direction, weighted as in `tangent_to_equirect`; meant for probabilities.
 
     Returns:
-        ``(..., H, W)`` class indices. The first of several equal scores wins. Pixels of images with
-        a score that is NaN or infinite do not count; the index is K where no others are left.
+        ``(..., H, W)`` class indices. The first of several equal scores wins. The index is K where
+        a score is NaN or infinite.
         An int64 tensor on the device of the logits, or an array, uint8 below 256 classes and else
         uint16.
 
@@ -347,23 +328,13 @@ def tangent_to_labels(
     blend = blend_back(grid, blend)
     shape = check_shape(shape)
     check_images("scores", scores, grid)
-    is_summed = blend == "feather" and scores.device.type != "cpu"
     labels: list[Tensor] = []
     for stack in scores.reshape(-1, *scores.shape[-4:]):
-        if not stack.sum().isfinite() and (unknown := without_softmax(stack)).any():
-            # Minus infinity is a score that never wins; means skip it like NaN.
-            stack = stack.float().masked_fill(unknown, torch.nan).clamp(min=_NEVER)  # noqa: PLW2901
-            means = MeanMosaic(shape, blend, stack.shape[1], device=stack.device)
-            means.add(stack, PinholeViews(grid))
-            highest, best = means.values().max(dim=0)
-            best = best.where(highest.isfinite(), stack.shape[1])
-            labels.append(best.to(torch.uint8 if stack.shape[1] < 256 else torch.uint16))
-            continue
         mosaic = Mosaic(
             shape,
             stack.shape[1],
             blend,
-            averaged=is_summed,
+            averaged=False,
             device=scores.device,
             backend="numba" if scores.device.type == "cpu" else "torch",
         )

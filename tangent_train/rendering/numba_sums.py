@@ -78,9 +78,15 @@ class NumbaSums:
 
     def _owners(self, images: Views) -> NDArray[np.integer]:
         """Return the owner of each pixel, cached until images of another set are added."""
-        if self._owned[0] is not images.all_images:
-            self._owned = images.all_images, images.owners(self._shape)
+        if self._owned[0] != images.key:
+            self._owned = images.key, images.owners(self._shape)
         return self._owned[1]
+
+    def unknown(self) -> Tensor:
+        """Return the number of pixels at which a view has a score that is NaN or infinite."""
+        if len(self.sums):
+            return torch.tensor(np.isnan(self.sums[..., 0]).sum())
+        return torch.tensor((self._labels == self._channels).sum())
 
     def rows(self, rows: slice | NDArray[np.intp]) -> Tensor:
         """Return the sums ``(h, W, K)`` of some rows."""

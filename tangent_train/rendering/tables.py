@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
+from functools import lru_cache
 from os import register_at_fork
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
@@ -17,7 +18,6 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid, equirect_latitudes, equirect_longitudes
@@ -25,8 +25,6 @@ from tangent_train.rendering import kernels
 from tangent_train.rendering.kernels import Array, njit_exact, over_rows
 
 Value = TypeVar("Value", bound=tuple[Any, ...])
-Positions = tuple[Tensor, Tensor]
-"""Columns and rows ``(P,)`` in a panorama."""
 Rays = tuple[Array, Array]
 """``(2, W)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""
 
@@ -87,18 +85,21 @@ def _nbytes(table: tuple[Any, ...]) -> int:
     return sum(part.nbytes for part in table)
 
 
-TABLES = TableCache(limit=512 * 2**20)
+TABLES = TableCache(limit=2**30)
 _ROTATED_SHARE = 16
 _ROTATED = TableCache(limit=TABLES.limit // _ROTATED_SHARE)
 """Tables of rotated grids, reused for depth and labels after RGB. They have a separate cache,
 because random rotations would evict all other tables."""
 
+_DEVICE_SHARE = 8
+"""Tables on a GPU take at most an eighth of its memory."""
+
 
 def set_table_cache_limit(nbytes: int) -> None:
-    """Limit the memory of the rendering tables of this process; the default is 512 MiB.
+    """Limit the memory of the rendering tables of this process; the default is 1 GiB.
 
-    At level 10 and base level 1 the tables take 168 MB from panorama to images and, for tensors,
-    117 MB back. Tables on a GPU count too. Tables of rotated grids may use another sixteenth.
+    At level 10 and base level 1 the tables take 168 MB from panorama to images. Tables of rotated
+    grids may use another sixteenth, and tables on a GPU an eighth of its memory.
 
     Args:
         nbytes: Maximum number of bytes in the cache; 0 disables it.
@@ -112,13 +113,35 @@ def set_table_cache_limit(nbytes: int) -> None:
     _ROTATED.set_limit(nbytes // _ROTATED_SHARE)
 
 
-def cached(key: Hashable, build: Callable[[], Value], *, is_rotated: bool) -> Value:
-    """Return the table of a key from one of the two caches, see `TableCache.get`."""
+@lru_cache
+def _tables_on(device: torch.device) -> TableCache:
+    """Return the cache of tables on a device other than the CPU."""
+    if device.type == "cuda" and torch.cuda.is_available():
+        return TableCache(torch.cuda.get_device_properties(device).total_memory // _DEVICE_SHARE)
+    return TableCache(TABLES.limit)
+
+
+def cached(
+    key: Hashable,
+    build: Callable[[], Value],
+    *,
+    is_rotated: bool = False,
+    device: torch.device | None = None,
+) -> Value:
+    """Return the table of a key from the cache of its device, see `TableCache.get`."""
+    if device is not None and device.type != "cpu":
+        return _tables_on(device).get(key, build)
     return (_ROTATED if is_rotated else TABLES).get(key, build)
 
 
-def _cached(grid: PinholeGrid, key: tuple[Hashable, ...], build: Callable[[], Value]) -> Value:
-    return cached((grid, *key), build, is_rotated=grid.rotation is not None)
+def cached_of(
+    grid: PinholeGrid,
+    key: tuple[Hashable, ...],
+    build: Callable[[], Value],
+    device: torch.device | None = None,
+) -> Value:
+    """Return the table of a key and a grid, see `cached`."""
+    return cached((grid, *key), build, is_rotated=grid.rotation is not None, device=device)
 
 
 def forward_map(
@@ -137,31 +160,18 @@ def forward_map(
     """
 
     def build() -> EquirectMap:
-        return EquirectMap.of(*_positions(grid, shape, faces, dtype), shape)
+        return EquirectMap.of(*positions_of_pixels(grid, shape, faces, dtype), shape)
 
-    return _cached(grid, ("forward", shape, tuple(faces.tolist()), dtype), build)
-
-
-def forward_positions(
-    grid: PinholeGrid, panorama: Tensor, faces: NDArray[np.int64], interpolation: str
-) -> Positions:
-    """Return columns and rows ``(P,)`` in a panorama ``(..., H, W)``, on its device."""
-    shape, device = (panorama.shape[-2], panorama.shape[-1]), panorama.device
-    dtype = map_dtype(panorama.dtype == torch.float64, interpolation)
-
-    def build() -> Positions:
-        u, v = _positions(grid, shape, faces, dtype)
-        return torch.from_numpy(u.ravel()).to(device), torch.from_numpy(v.ravel()).to(device)
-
-    return _cached(grid, ("positions", device, shape, tuple(faces.tolist()), dtype), build)
+    return cached_of(grid, ("forward", shape, tuple(faces.tolist()), dtype), build)
 
 
-def _positions(
+def positions_of_pixels(
     grid: PinholeGrid,
     shape: tuple[int, int],
     faces: NDArray[np.int64],
     dtype: np.dtype[np.floating],
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return positions in an ERP of the pixels of images, see `positions_of_rays`."""
     world_from_pixel = grid.world_from_camera[faces] @ np.linalg.inv(grid.camera_matrix)
     return positions_of_rays(world_from_pixel[..., [0, 2, 1]], plane_rays(grid.size), shape, dtype)
 
@@ -178,7 +188,7 @@ def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
         over_rows(_write_owners, *shape, *mesh, *rays, face)
         return (face,)
 
-    return _cached(grid, ("owners", shape), build)[0]
+    return cached_of(grid, ("owners", shape), build)[0]
 
 
 def _inner_cosine(grid: PinholeGrid) -> float:
@@ -307,7 +317,7 @@ def _covered_spans(
         over_rows(_write_spans, shape[0], len(faces), edges, sphere_rays(shape)[1], shape[1], spans)
         return (spans,)
 
-    return _cached(grid, ("spans", shape, tuple(faces.tolist())), build)[0]
+    return cached_of(grid, ("spans", shape, tuple(faces.tolist())), build)[0]
 
 
 @njit_exact

@@ -1,44 +1,52 @@
-"""Sums or labels of a canvas, accumulated by torch on any device; differentiable.
+"""Sums or labels of a canvas, computed by torch on any device; differentiable.
 
-The same sums as in `kernels`, but with the channels first: ``(K, H, W)``. On a GPU every call takes
-longer than its computation on few pixels, so the positions of all pixels that some images cover are
-computed at once, and each image is sampled in one call.
+The same sums as in `kernels`. They are one product of a sparse matrix with the values of all views:
+every pixel of the canvas is a weighted sum of four pixels of each view that it is taken from. The
+matrix depends on the views and the size of the canvas only, so it is kept for the next panoramas.
+The channels of a pixel are adjacent in memory, and `embedding_bag` adds them without a copy of the
+single terms.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
-from torch.nn.functional import grid_sample
+from torch.nn.functional import embedding_bag
+
+from tangent_train.rendering.tables import cached
+from tangent_train.rendering.tensors import on_device
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from tangent_train.rendering.kernels import CanvasGeometry
     from tangent_train.rendering.representations.views import Views
 
-    _Pixels = tuple[NDArray[np.int64], Callable[[Tensor, Tensor], Tensor]]
-    """Pixels of the canvas, image after image: the number ``(n,)`` for each image, and a function
-    that returns the flat indices of some of them, given their place in this list and their image.
-    """
+_ENTRIES_AT_ONCE = 2**25
+"""Largest number of entries of a matrix, 256 MiB; a canvas with more is divided by rows."""
 
-_SCORES_AT_ONCE = 2**25
-"""Number of scores sampled in one call, 128 MiB."""
+_SCORES_AT_ONCE = 2**29
+"""Number of sums that are held at once if only labels are kept, 2 GiB."""
 
 _PIXELS_AT_ONCE = 2**21
-"""Number of pixels whose positions or best classes are determined at once."""
+"""Number of pixels whose positions are computed at once."""
 
-_SHARE = 4
-"""On a GPU, sums take at most a quarter of the memory."""
+_SHARE = 8
+"""On a GPU, sums take at most an eighth of the memory; the values of the views take more."""
 
-_BYTES = 2**33
-"""On other devices, sums take at most 8 GiB."""
+_BYTES = 2**32
+"""On other devices, sums take at most 4 GiB."""
+
+_NEVER = -1e30
+"""Stands for a score of minus infinity, whose product with a weight of 0 would be NaN."""
+
+_LARGEST = 1e20
+"""Scores beyond it are infinite, or weighted sums with `_NEVER`."""
 
 
 def fits_on(device: torch.device | str, shape: tuple[int, int], num_classes: int) -> bool:
@@ -47,6 +55,51 @@ def fits_on(device: torch.device | str, shape: tuple[int, int], num_classes: int
     if torch.device(device).type == "cuda" and torch.cuda.is_available():
         limit = torch.cuda.get_device_properties(device).total_memory // _SHARE
     return 4 * num_classes * math.prod(shape) <= limit
+
+
+class Taps(NamedTuple):
+    """A sparse matrix: the pixels of views whose weighted sums are the pixels of a canvas.
+
+    Attributes:
+        index: ``(E,)`` flat indices of pixels of the views ``(N, h, w)``, int32; N h w where a
+            view may cover the pixel of the canvas, but does not.
+        weight: ``(E,)`` weights.
+        first: ``(P + 1,)`` first entry of each pixel of the canvas, and E; int32.
+    """
+
+    index: Tensor
+    weight: Tensor
+    first: Tensor
+
+    def sums(self, values: Tensor) -> Tensor:
+        """Return the sums ``(P, K)`` of values ``(N h w + 1, K)``: pixels of views, and zeros."""
+        index, weight, first = self
+        how: Any = {"mode": "sum", "per_sample_weights": weight, "include_last_offset": True}
+        return embedding_bag(index, values, first, **how)
+
+    def transposed(self, count: int) -> Taps:
+        """Return the transposed matrix, with one row for each of `count` values."""
+        index, order = self.index.sort(stable=True)
+        numbers = torch.arange(max(len(index), count + 1), dtype=torch.int32, device=index.device)
+        first = torch.searchsorted(index, numbers[: count + 1], out_int32=True)
+        entries = numbers[: len(index)]
+        pixel = torch.searchsorted(self.first, entries, right=True, out_int32=True) - 1
+        return Taps(pixel[order], self.weight[order], first)
+
+
+class _Product(torch.autograd.Function):
+    """Product with a sparse matrix; the gradient of `embedding_bag` takes much longer."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, taps: Taps, back: Taps) -> Tensor:
+        """Return the sums."""
+        ctx.taps, ctx.back = taps, back
+        return taps.sums(values)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        """Return the product with the transposed matrix."""
+        return _Product.apply(gradient.contiguous(), ctx.back, ctx.taps), None, None
 
 
 class TorchSums:
@@ -62,14 +115,21 @@ class TorchSums:
         averaged: bool,
         softmax: bool,
     ) -> None:
-        self._shape, self._channels, self._softmax = shape, channels, softmax
-        size, pixels = channels if averaged else 0, math.prod(shape)
-        self._sums = torch.zeros((size, pixels), dtype=dtype, device=device)
-        self._labels = torch.zeros(pixels, dtype=torch.int32, device=device)
-        self._owned: tuple[object, Tensor, NDArray[np.int64]] | None = None
+        self._shape, self._channels, self._dtype = shape, channels, dtype
+        self._averaged, self._softmax, self._device = averaged, softmax, device
+        self._sums: Tensor | None = None
+        self._labels = torch.zeros(math.prod(shape), dtype=self._label_dtype, device=device)
+        self._views: Views | None = None
+        self._rows = self._values = self._labels
+        self._missing = np.zeros(0, np.bool_)
+        self._is_feathered = False
+
+    @property
+    def _label_dtype(self) -> torch.dtype:
+        return torch.uint8 if self._channels < 256 else torch.uint16
 
     def add(self, values: Tensor, images: Views, *, is_feathered: bool) -> None:
-        """Add some images, see `NumbaSums.add`.
+        """Add some images, see `NumbaSums.add`; all images of a set are summed at once.
 
         Args:
             values: ``(n, K, h, w)`` values of the images, on the device.
@@ -77,145 +137,240 @@ class TorchSums:
             is_feathered: True to feather them, which needs sums; False to take each pixel from its
                 owner.
         """
-        geometry = images.geometry(self._shape, None)
-        if is_feathered and self._softmax:
-            values = _softmax(values, 1)
-        offsets_at, by_image = _offsets_in(geometry, values), values.split(1)
-        counts, flat_at = (
-            _covered_pixels(geometry, values.device) if is_feathered else self._owned_pixels(images)
-        )
-        edges = np.concatenate([[0], counts.cumsum()])
-        edges_there = _on_device(edges, values.device)
-        at_once = max(1, min(_PIXELS_AT_ONCE, _SCORES_AT_ONCE // self._channels))
-        for start in range(0, int(edges[-1]), at_once):
-            stop = min(start + at_once, int(edges[-1]))
-            places = torch.arange(start, stop, device=values.device)
-            image = torch.searchsorted(edges_there, places, right=True) - 1
-            flat = flat_at(places, image)
-            offsets = offsets_at(image, flat)
-            positions, weight = offsets.to(values.dtype).T[None, None], None
-            if is_feathered:
-                weight = (1 - offsets.square()).clamp_(min=0).prod(dim=0).sqrt_().to(values.dtype)
-            limits = edges.clip(start, stop) - start
-            for m in np.flatnonzero(np.diff(limits)).tolist():
-                part = slice(int(limits[m]), int(limits[m + 1]))
-                sampled = grid_sample(
-                    by_image[m],
-                    positions[:, :, part],
-                    padding_mode="border",
-                    align_corners=False,
-                )
-                sampled = sampled.view(self._channels, -1)
-                self._add(sampled, flat[part], None if weight is None else weight[part])
+        if self._views is None or self._views.key != images.key:
+            self._finish()
+            self._views, self._is_feathered = images.whole, is_feathered
+            size = images.num_images, *values.shape[2:]
+            rows = (math.prod(size) + 1, self._channels)
+            self._rows = torch.empty(rows, dtype=self._dtype, device=values.device)
+            self._rows[-1] = 0
+            self._values = self._rows[:-1].unflatten(0, size)
+            self._missing = np.ones(images.num_images, np.bool_)
+        chosen, given = _as_slice(images.chosen), values.movedim(1, -1)
+        part = self._values[chosen]  # a copy, unless they are consecutive
+        if self._softmax and is_feathered:
+            torch.softmax(given, -1, dtype=self._dtype, out=part)
+        elif self._softmax or not self._averaged:
+            torch.clamp(given, min=_NEVER, out=part)
+        else:
+            part.copy_(given)
+        if not isinstance(chosen, slice):
+            self._values[chosen] = part
+        self._missing[images.chosen] = False
+        if not self._missing.any():
+            self._finish()
 
-    def _add(self, sampled: Tensor, index: Tensor, weight: Tensor | None) -> None:
-        """Add values of one image to P different pixels of the canvas.
-
-        Args:
-            sampled: ``(K, P)`` values.
-            index: ``(P,)`` flat indices of the pixels.
-            weight: ``(P,)`` weights; None for pixels that the image owns.
-        """
-        if not len(self._sums):
-            self._labels[index] = self._best(sampled, -torch.inf)[1].int()
+    def _finish(self) -> None:
+        """Sum the images of a set up."""
+        if self._views is None:
             return
-        if weight is not None:
-            sampled = sampled * weight
-        elif self._softmax:
-            sampled = _softmax(sampled, 0)
-        # The pixels are different, so the order of additions does not vary.
-        self._sums.index_add_(1, index, sampled)
+        views, values, self._views = self._views, self._rows, None
+        if self._missing.any():
+            self._values[np.flatnonzero(self._missing).tolist()] = 0
+        size, self._rows = (self._values.shape[1], self._values.shape[2]), self._labels
+        self._values = self._labels
+        matrix = _Matrix(views, self._shape, size, values, self._is_feathered)
+        if not self._averaged:
+            parts = matrix.parts(
+                math.ceil(values.shape[1] * math.prod(self._shape) / _SCORES_AT_ONCE)
+            )
+            best = [self._best(matrix.sums(values, part)) for part in parts]
+            self._labels = _joined(best)
+            return
+        sums = _joined([matrix.sums(values, part) for part in matrix.parts()])
+        if self._softmax and not self._is_feathered:
+            sums = sums.masked_fill(sums.amax(dim=-1, keepdim=True) < -_LARGEST, math.nan).softmax(
+                -1
+            )
+        self._sums = sums if self._sums is None else self._sums + sums
 
-    def _best(self, scores: Tensor, floor: float) -> tuple[Tensor, Tensor]:
-        """Return the largest of K scores and its index, which is K up to a floor."""
-        highest, best = _without_nan(scores).max(dim=0)
-        return highest, best.where(highest > floor, self._channels)
+    def _best(self, scores: Tensor, min_confidence: float = 0.0) -> Tensor:
+        """Return the index of the largest of K scores or sums of probabilities ``(P, K)``, or K."""
+        highest, best = scores.max(dim=-1)  # NaN if one is NaN
+        known = highest > 0 if self._averaged else highest.abs() < _LARGEST
+        if min_confidence > 0:
+            known &= highest >= min_confidence * scores.sum(dim=-1)
+        return best.where(known, self._channels).to(self._label_dtype)
 
-    def _owned_pixels(self, images: Views) -> _Pixels:
-        """List the pixels that images own; the table is kept until images of another set follow."""
-        device = self._sums.device
-        if self._owned is None or self._owned[0] is not images.all_images:
-            owner = images.owners(self._shape).ravel()
-            order = _on_device(owner.argsort(kind="stable"), device)
-            self._owned = images.all_images, order, np.bincount(owner, minlength=images.num_images)
-        _, order, all_counts = self._owned
-        counts = all_counts[images.chosen]
-        first = (all_counts.cumsum() - all_counts)[images.chosen]
-        shift = _on_device(first - (counts.cumsum() - counts), device)
-        return counts, lambda places, image: order[places + shift[image]]
+    def _total(self) -> Tensor:
+        """Return the sums ``(H W, K)`` of all images that were added."""
+        self._finish()
+        if self._sums is None:
+            size = (math.prod(self._shape), self._channels)
+            self._sums = torch.zeros(size, dtype=self._dtype, device=self._device)
+        return self._sums
+
+    def unknown(self) -> Tensor:
+        """Return the number of pixels at which a view has a score that is NaN or infinite."""
+        self._finish()
+        if self._averaged:
+            return self._total()[:, 0].isnan().sum()
+        return (self._labels == self._channels).sum()
 
     def rows(self, rows: slice | NDArray[np.intp]) -> Tensor:
         """Return the sums ``(h, W, K)`` of some rows."""
         index = rows if isinstance(rows, slice) else rows.tolist()
-        return self._sums.unflatten(1, self._shape)[:, index].movedim(0, -1)
+        return self._total().view(*self._shape, self._channels)[index]
 
     def labels(self, min_confidence: float) -> Tensor:
         """Return ``(H, W)`` indices of the best classes; K where the confidence is too low."""
-        for start in range(0, math.prod(self._shape) if len(self._sums) else 0, _PIXELS_AT_ONCE):
-            sums = self._sums[:, start : start + _PIXELS_AT_ONCE]
-            highest, best = self._best(sums, 0.0 if self._softmax else -torch.inf)
-            if min_confidence > 0:
-                unsure = highest < min_confidence * sums.sum(dim=0)
-                best = best.masked_fill(unsure, self._channels)
-            self._labels[start : start + _PIXELS_AT_ONCE] = best
-        dtype = torch.uint8 if self._channels < 256 else torch.uint16
-        return self._labels.to(dtype).view(self._shape)
+        self._finish()
+        if self._averaged:
+            self._labels = self._best(self._total(), min_confidence)
+        return self._labels.view(self._shape)
 
 
-def _covered_pixels(canvas: CanvasGeometry, device: torch.device) -> _Pixels:
-    """List the pixels that images may cover, from the spans of the geometry."""
-    height, width = len(canvas.rows), canvas.columns.shape[1]
-    first, counts = canvas.spans.astype(np.int64).reshape(-1, 2).T
-    ends = counts.cumsum()
-    shifts, ends_there = _on_device(first - (ends - counts), device), _on_device(ends, device)
+class _Matrix:
+    """The sparse matrix from the views of a set to a canvas, in a cache of limited size.
 
-    def flat_at(places: Tensor, image: Tensor) -> Tensor:
-        del image
-        line = torch.searchsorted(ends_there, places, right=True)
-        return (line % height) * width + (places + shifts[line]) % width
-
-    return counts.reshape(-1, height).sum(axis=1), flat_at
-
-
-def _offsets_in(canvas: CanvasGeometry, values: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
-    """Return a function for the positions of P canvas pixels in images ``(n, K, h, w)``.
-
-    Returns:
-        A function that returns ``(2, P)`` offsets from the center of the image in half image sides,
-        and 2 for directions behind the image, given images and flat indices ``(P,)``.
+    Args:
+        views: All N views.
+        shape: ``(H, W)`` of the canvas.
+        size: Rows and columns of a view.
+        values: ``(N h w + 1, K)`` values, which determine device and dtype.
+        is_feathered: See `TorchSums.add`.
     """
-    device, (height, width) = values.device, values.shape[-2:]
-    scaled = np.diag([2 / width, 2 / height, 1]) @ canvas.matrices
-    scaled[:, :2] += np.array([[1 / width - 1], [1 / height - 1]]) * canvas.matrices[:, 2:]
-    dtype = np.float32 if device.type == "mps" else np.float64
-    m, c, r = (
-        _on_device(array.astype(dtype, copy=False), device)
-        for array in (scaled.transpose(1, 0, 2), canvas.columns, canvas.rows)
-    )
-    with torch.autocast(device.type, enabled=False):
-        of_columns, of_rows = (m[..., :2] @ c).flatten(1), (m[..., 2:] * r[:, 1]).flatten(1)
 
-    def offsets(image: Tensor, flat: Tensor) -> Tensor:
-        row, column = flat // c.shape[1], flat % c.shape[1]
-        across = of_columns.index_select(1, image * c.shape[1] + column)
-        down = of_rows.index_select(1, image * len(r) + row)
-        xyz = torch.addcmul(down, r[:, 0].index_select(0, row), across)
+    def __init__(
+        self,
+        views: Views,
+        shape: tuple[int, int],
+        size: tuple[int, int],
+        values: Tensor,
+        is_feathered: bool,
+    ) -> None:
+        self._views, self._shape, self._size = views, shape, size
+        self._device, self._dtype = values.device, values.dtype
+        self._canvas = views.geometry(shape, None if is_feathered else views.owners(shape))
+        self._count, self._is_feathered = len(values), is_feathered
+
+    def parts(self, least: int = 1) -> list[tuple[int, int]]:
+        """Return the first row of each part of the canvas, and the row after the last."""
+        pixels = self._canvas.spans[..., 1].sum() if self._is_feathered else math.prod(self._shape)
+        count = max(least, math.ceil(4 * int(pixels) / _ENTRIES_AT_ONCE))
+        edges = np.linspace(0, self._shape[0], count + 1).astype(int).tolist()
+        return list(itertools.pairwise(edges))
+
+    def sums(self, values: Tensor, part: tuple[int, int]) -> Tensor:
+        """Return the sums ``(P, K)`` of some rows of the canvas."""
+        build = self._feathered if self._is_feathered else self._owned
+        key = (
+            "taps",
+            self._views.key,
+            self._shape,
+            self._size,
+            self._dtype,
+            self._is_feathered,
+            part,
+        )
+        where: Any = {"is_rotated": self._views.is_rotated, "device": self._device}
+        taps = cached(key, lambda: build(*part), **where)
+        if not values.requires_grad:
+            return taps.sums(values)
+        back = cached((*key, "back"), lambda: taps.transposed(self._count), **where)
+        return _Product.apply(values, taps, back)
+
+    def _owned(self, top: int, bottom: int) -> Taps:
+        """Return taps in the owner of each pixel."""
+        owner = on_device(self._canvas.owner[top:bottom].astype(np.int64).ravel(), self._device)
+        flat = torch.arange(top * self._shape[1], bottom * self._shape[1], device=self._device)
+        parts = [
+            self._bilinear(image, self._offsets(image, pixels))
+            for image, pixels in zip(
+                owner.split(_PIXELS_AT_ONCE), flat.split(_PIXELS_AT_ONCE), strict=True
+            )
+        ]
+        index, weight = (torch.cat(lines).flatten() for lines in zip(*parts, strict=True))
+        first = torch.arange(0, len(index) + 1, 4, dtype=torch.int32, device=self._device)
+        return Taps(index, weight, first)
+
+    def _feathered(self, top: int, bottom: int) -> Taps:
+        """Return taps in all images that cover each pixel."""
+        height, width = bottom - top, self._shape[1]
+        first_column, counts = self._canvas.spans[:, top:bottom].astype(np.int64).reshape(-1, 2).T
+        ends = counts.cumsum()
+        there = (on_device(part, self._device) for part in (first_column - (ends - counts), ends))
+        shifts, ends_there = there
+        parts = []
+        for start in range(0, int(ends[-1]), _PIXELS_AT_ONCE):
+            stop = min(start + _PIXELS_AT_ONCE, int(ends[-1]))
+            place = torch.arange(start, stop, device=self._device)
+            line = torch.searchsorted(ends_there, place, right=True)
+            flat = (line % height) * width + (place + shifts[line]) % width
+            offsets = self._offsets(line // height, flat + top * width)
+            index, weight = self._bilinear(line // height, offsets)
+            feather = (1 - offsets.square()).clamp_(min=0).prod(dim=0).sqrt_()[:, None]
+            index = index.where(feather > 0, self._count - 1)
+            parts.append((index, weight * feather.to(self._dtype), flat.int()))
+        index, weight, flat = (torch.cat(lines) for lines in zip(*parts, strict=True))
+        flat, order = flat.sort(stable=True)
+        pixels = torch.arange(height * width + 1, dtype=torch.int32, device=self._device)
+        first = 4 * torch.searchsorted(flat, pixels, out_int32=True)
+        return Taps(index[order].flatten(), weight[order].flatten(), first)
+
+    def _bilinear(self, image: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        """Return flat indices and weights ``(P, 4)`` of the pixels around P positions.
+
+        Args:
+            image: ``(P,)`` numbers of the images.
+            offsets: See `_offsets`.
+        """
+        height, width = self._size
+        sides = ((width, offsets[0]), (height, offsets[1]))
+        u, v = ((((at + 1) * side - 1) / 2).clamp_(0, side - 1) for side, at in sides)
+        column, row = (
+            u.floor().clamp_(max=max(0, width - 2)),
+            v.floor().clamp_(max=max(0, height - 2)),
+        )
+        right, below = (u - column).to(self._dtype), (v - row).to(self._dtype)
+        first = ((image * height + row.int()) * width + column.int()).int()
+        across, down = min(1, width - 1), min(1, height - 1) * width
+        index = torch.stack([first + step for step in (0, across, down, down + across)], dim=-1)
+        upper, lower = 1 - below, below
+        weights = [upper * (1 - right), upper * right, lower * (1 - right), lower * right]
+        return index, torch.stack(weights, dim=-1)
+
+    @cached_property
+    def _factors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Homogeneous offsets in all images of all columns and rows; factors of the rows."""
+        canvas, (height, width) = self._canvas, self._size
+        scaled = np.diag([2 / width, 2 / height, 1]) @ canvas.matrices
+        scaled[:, :2] += np.array([[1 / width - 1], [1 / height - 1]]) * canvas.matrices[:, 2:]
+        matrices = scaled.transpose(1, 0, 2)
+        of_columns = (matrices[..., :2] @ canvas.columns).reshape(3, -1)
+        of_rows = (matrices[..., 2:] * canvas.rows[:, 1]).reshape(3, -1)
+        dtype = np.float32 if self._device.type == "mps" else np.float64
+        given = (of_columns, of_rows, canvas.rows[:, 0])
+        columns, rows, factors = (
+            on_device(part.astype(dtype, copy=False), self._device) for part in given
+        )
+        return columns, rows, factors
+
+    def _offsets(self, image: Tensor, flat: Tensor) -> Tensor:
+        """Return the positions of P pixels of the canvas in images.
+
+        Args:
+            image: ``(P,)`` indices of the images.
+            flat: ``(P,)`` flat indices of the pixels.
+
+        Returns:
+            ``(2, P)`` offsets from the center of the image in half image sides, and 2 for
+            directions behind the image.
+        """
+        (height, width), (of_columns, of_rows, factors) = self._shape, self._factors
+        row, column = flat // width, flat % width
+        across = of_columns.index_select(1, image * width + column)
+        down = of_rows.index_select(1, image * height + row)
+        xyz = torch.addcmul(down, factors.index_select(0, row), across)
         return (xyz[:2] / xyz[2]).masked_fill_(xyz[2] <= 0, 2)
 
-    return offsets
+
+def _as_slice(numbers: NDArray[np.int64]) -> slice | list[int]:
+    """Return consecutive numbers as a slice, which is not a copy."""
+    start, stop = int(numbers[0]), int(numbers[-1]) + 1
+    return slice(start, stop) if stop - start == len(numbers) else numbers.tolist()
 
 
-def _on_device(array: NDArray[Any], device: torch.device) -> Tensor:
-    """Copy an array to a device; a GPU is not waited for."""
-    tensor = torch.from_numpy(np.ascontiguousarray(array))
-    pinned = tensor.pin_memory() if device.type == "cuda" else tensor
-    return pinned.to(device, non_blocking=True)
-
-
-def _without_nan(scores: Tensor) -> Tensor:
-    return scores.masked_fill(scores.isnan(), -torch.inf)
-
-
-def _softmax(scores: Tensor, dim: int) -> Tensor:
-    """Return the softmax over a dimension; NaN gets probability 0."""
-    return _without_nan(scores).softmax(dim=dim).nan_to_num_(0.0)
+def _joined(parts: list[Tensor]) -> Tensor:
+    """Concatenate tensors; one is not copied."""
+    return torch.cat(parts) if len(parts) > 1 else parts[0]

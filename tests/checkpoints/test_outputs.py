@@ -85,21 +85,3 @@ def test_a_single_score_and_probabilities_that_are_not_finite_are_nan(
         scores[..., 1] = wrong
         largest = as_logits(scores, kind, count).amax(dim=1)[0, 0]
         assert largest.isfinite().tolist() == [True, False]
-
-
-class _InfiniteColumn(nn.Module):
-    """Two classes, infinite in the first column."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        scores = images[:, :2].clone()
-        scores[..., 0] = torch.inf
-        return scores
-
-
-def test_a_tile_that_is_not_finite_does_not_spoil_its_neighbors() -> None:
-    """Tiles begin in columns 0 and 4; the second one is infinite where the first is finite."""
-    images = torch.randn(1, 3, 4, 10)
-    found = OutputNetwork(_InfiniteColumn(), 2, tile=(4, 6))(images)
-    expected = images[:, :2].clone()
-    expected[..., 0] = torch.nan
-    torch.testing.assert_close(found, expected, equal_nan=True)

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from tangent_train.geometry import (
+    CubeGrid,
     PinholeGrid,
     RingGrid,
     TangentGrid,
@@ -116,33 +117,47 @@ def test_classes_of_minus_infinity_have_no_probability(blend: Blend, backend: An
     assert (_labels(result) == 1).all()
 
 
+@pytest.mark.parametrize("averaged", [False, True])
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_a_score_of_minus_infinity_never_wins_and_does_not_spoil_others(
+    backend: Any, averaged: bool
+) -> None:
+    """At borders of cube faces, an infinite score has a weight of 0."""
+    grid, shape = CubeGrid(16), (64, 128)
+    scores = _scores(grid)
+    scores[torch.rand(scores.shape, generator=torch.Generator().manual_seed(0)) < 0.3] = -torch.inf
+    scores[:, 6] = -9
+    expected = tangent_to_equirect(scores.double().clamp(min=-1e30), grid, shape).argmax(dim=0)
+    result = ScoreMosaic(shape, 7, "nearest", averaged=averaged, backend=backend)
+    np.testing.assert_array_equal(_labels(_added(result, scores, grid)), expected)
+    assert result.not_finite == 0
+
+
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("averaged", [False, True])
 @pytest.mark.parametrize("backend", ["numba", "torch"])
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_views_that_are_not_finite_are_as_if_left_out(
+def test_scores_that_are_not_finite_make_all_pixels_unknown_that_depend_on_them(
     blend: Blend, backend: Any, averaged: bool, wrong: float
 ) -> None:
-    """The largest score of five views is not finite; others decide, or no class is known."""
     grid, shape = GRIDS[0]
     scores = _scores(grid)
-    kept = ScoreMosaic(shape, 7, blend, averaged=True, backend=backend)
-    kept.add(scores[5:], PinholeViews(grid)[5:])
-    scores[:5, slice(None) if wrong < 0 else 3] = wrong
+    expected = _labels(_added(ScoreMosaic(shape, 7, blend, backend=backend), scores, grid))
+    seen = torch.zeros(20, 1, *grid.size)
+    seen[:5, :, 3:] = 1
+    spoiled = tangent_to_equirect(seen, grid, shape, blend)[0].numpy() > 0
+    assert 0.1 < spoiled.mean() < 0.6
+    scores[:5, slice(None) if wrong < 0 else 3, 3:] = wrong
     result = ScoreMosaic(shape, 7, blend, averaged=averaged, backend=backend)
     _added(result, scores.double(), grid)  # networks may compute in float64
-    known = _probabilities(kept).sum(axis=-1) > 0
-    assert 0.6 < known.mean() < 1
-    assert (_labels(result)[~known] == 7).all()
-    assert result.not_finite == pytest.approx(5 / grid.num_images)
-    np.testing.assert_array_equal(_labels(result)[known], _labels(kept)[known])
+    labels = _labels(result)
+    np.testing.assert_array_equal(labels, np.where(spoiled, 7, expected))
+    assert float(result.not_finite) == pytest.approx(spoiled.mean())
     if averaged or blend == "feather":
-        np.testing.assert_allclose(_probabilities(result), _probabilities(kept), atol=1e-6)
-    labels = tangent_to_labels(
-        scores.softmax(1) if blend == "feather" else scores, grid, shape, blend
-    )
-    assert (labels[~known] == 7).all()
-    assert (labels[known] < 7).all()
+        assert (_probabilities(result).sum(axis=-1) > 0.99).tolist() == (~spoiled).tolist()
+    given = scores.softmax(1) if blend == "feather" else scores
+    found = tangent_to_labels(given, grid, shape, blend)
+    np.testing.assert_array_equal(found == 7, spoiled)
 
 
 def test_large_sums_are_in_a_file_and_equal(monkeypatch: pytest.MonkeyPatch) -> None:

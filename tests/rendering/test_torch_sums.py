@@ -97,7 +97,7 @@ def test_torch_blends_depth_as_the_compiled_kernels_do(name: str, blend: Blend) 
 def test_torch_agrees_with_the_compiled_kernels(
     name: str, blend: Blend, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(torch_sums, "_SCORES_AT_ONCE", 2**15)
+    monkeypatch.setattr(torch_sums, "_ENTRIES_AT_ONCE", 2**15)
     make, shape = SETS[name]
     sets, classes = make(blend), 6
     settings = settings | {"blend": blend, "averaged": len(sets) > 1 or "averaged" in settings}

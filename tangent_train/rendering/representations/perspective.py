@@ -9,7 +9,7 @@ with a shift Δ that keeps it inside the photo.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -69,9 +69,14 @@ class PhotoCrops(Views):
         return len(self.boxes)
 
     @property
-    def all_images(self) -> object:  # type: ignore[override]
+    def key(self) -> Hashable:  # type: ignore[override]
         """See `Views`."""
-        return self.boxes
+        return self._on_canvas.tobytes(), self.size
+
+    @property
+    def whole(self) -> Self:
+        """See `Views`."""
+        return replace(self, numbers=None)
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """See `Views`; arrays must be uint8 for ``bilinear``."""

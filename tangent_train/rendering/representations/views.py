@@ -9,7 +9,7 @@ provide their position on its canvas (see `kernels`). `inference.engine` passes 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, Self, runtime_checkable
 
@@ -40,13 +40,20 @@ class Views:
         is_overlapping: True if every pixel is inside an image, not only on its outer edge.
         chosen: ``(n,)`` numbers of these views, 0 … N − 1.
         num_images: Number N of views in the set.
-        all_images: An object that identifies the set of N views.
+        key: A value that views of the same set of N views share.
+        is_rotated: True if the set is one of many under different rotations.
     """
 
     is_overlapping: bool
     chosen: NDArray[np.int64]
-    num_images: int
-    all_images: object
+    num_images: int = 1
+    key: Hashable
+    is_rotated: bool = False
+
+    @property
+    def whole(self) -> Self:
+        """All N views of the set."""
+        return self
 
     def __len__(self) -> int:
         return len(self.chosen)
@@ -165,9 +172,19 @@ class PinholeViews(Views):
         return self.grid.face_indices(self.faces)
 
     @property
-    def all_images(self) -> object:  # type: ignore[override]
+    def key(self) -> Hashable:  # type: ignore[override]
         """See `Views`."""
         return self.grid
+
+    @property
+    def is_rotated(self) -> bool:  # type: ignore[override]
+        """See `Views`."""
+        return self.grid.rotation is not None
+
+    @property
+    def whole(self) -> Self:
+        """See `Views`."""
+        return replace(self, faces=None)
 
     @property
     def num_images(self) -> int:  # type: ignore[override]
