@@ -17,9 +17,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+
+from datamodules.core.inputs import RGB_NORMALIZATION
+from models import UNet
+from tangent_train.checkpoints.loaded import LoadedNetwork
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 """Device of the GPU benchmarks."""
@@ -130,6 +134,23 @@ def measure(alternatives: Sequence[Alternative], rounds: int) -> list[Row]:
             if number < alternatives[k].rounds:
                 rows[k].values.append(seconds(alternatives[k], repeats[k]) * alternatives[k].scale)
     return rows
+
+
+def tangent_network(level: int, widths: Sequence[int]) -> LoadedNetwork:
+    """Return an untrained UNet of 13 classes for tangent images of b = 0."""
+    torch.manual_seed(0)
+    settings: dict[str, Any] = {"in_channels": 3, "num_classes": 13, "widths": widths}
+    target = "tangent_train.rendering.TangentRepresentation"
+    return LoadedNetwork(
+        module=UNet(**settings).eval(),
+        class_names=("unknown", *map(str, range(13))),
+        inputs=("rgb",),
+        normalization=RGB_NORMALIZATION,
+        level=level,
+        representation={"_target_": target, "base_level": 0, "level": level},
+        image_size=(2**level, 2**level),
+        settings={"_target_": "models.UNet", **settings},
+    )
 
 
 def expect_agreement(name: str, share: float, least: float) -> None:

@@ -21,7 +21,7 @@ from tangent_train.config.help import (
 )
 from tangent_train.config.settings import SETTINGS, RunSettings
 from tangent_train.files import config_folder
-from tangent_train.results.published import facts, protocols, published_lines
+from tangent_train.results.published import facts, protocols
 
 CONFIGS = config_folder()
 REFERENCE = Path(__file__).parents[1] / "reference"
@@ -58,7 +58,8 @@ def pages() -> dict[Path, str]:
         generated[f"settings/{page}.md"] = (title, *map(_group, groups))
     experiments = map(_experiment, sorted((CONFIGS / "experiment").rglob("*.yaml")))
     generated["experiments.md"] = (_below_head("experiments.md"), *_EXPERIMENTS, *experiments, "")
-    generated["protocols.md"] = (_below_head("protocols.md"), *map(_protocol, protocols()))
+    data_sets = dict.fromkeys(facts(name)["data"] for name in protocols())
+    generated["protocols.md"] = (_below_head("protocols.md"), *map(_data_set, data_sets))
     return {REFERENCE / name: "\n".join(parts) for name, parts in generated.items()}
 
 
@@ -67,21 +68,26 @@ def _below_head(name: str) -> str:
     return (REFERENCE / name).read_text("utf-8").partition(_MARK)[0] + _MARK
 
 
-def _protocol(name: str) -> str:
-    entry = protocols()[name]
-    run = f"\n\n`experiment={entry['experiment']}`" if "experiment" in entry else ""
-    ordered = sorted(facts(name).items(), key=lambda fact: fact[0] not in ("data", "classes"))
-    listed = [f"| `{fact}` | {value} |" for fact, value in ordered]
-    lines = [line for line in published_lines() if line["protocol"] == name and line["mean"]]
-    columns = ("method", "stage", "trained_on", "level", "inputs", "fold", "score", "mean")
-    shown = [column for column in columns if any(line[column] for line in lines)]
-    rows = [
-        f"| {' | '.join(line[c] or '–' for c in shown)} | <{line['source']}> |" for line in lines
-    ]
-    head = [*(column.replace("_", " ") for column in shown), "source"]
-    table = [f"| {' | '.join(head)} |", f"| {' | '.join('---' for _ in head)} |", *rows]
-    text = f"## {name}\n\n{entry['about']}{run}\n\n| fact | value |\n| --- | --- |\n"
-    return text + "\n".join([*listed, "", *(table if lines else ["No score is published."]), ""])
+def _data_set(data: str) -> str:
+    """Return the section of a data set: the facts of its protocols, and notes on them."""
+    found = {name: facts(name) for name in protocols() if facts(name)["data"] == data}
+    counts = Counter(fact for of in found.values() for fact in of.items())
+    usual = dict(fact for fact, count in counts.items() if count > max(1, len(found) / 2))
+    rows, notes = [], []
+    for name, of in found.items():
+        entry = protocols()[name]
+        run = f"`{entry['experiment']}`" if "experiment" in entry else "–"
+        every = dict.fromkeys(usual, "–") | of  # depth has no classes
+        own = _facts({fact: value for fact, value in every.items() if usual.get(fact) != value})
+        rows.append(f"| `{name}` | {own} | {run} |")
+        notes += [f"* `{name}`: {entry['about']}"] if "about" in entry else []
+    start = f"Unless a row states other values: {_facts(usual)}.\n\n" if usual else ""
+    table = ["| protocol | facts | experiment |", "| --- | --- | --- |", *rows, ""]
+    return f"## {data}\n\n{start}" + "\n".join([*table, *notes, ""])
+
+
+def _facts(values: Mapping[str, str]) -> str:
+    return "; ".join(f"`{name}` {value}" for name, value in values.items() if name != "data")
 
 
 def _command(name: str) -> str:

@@ -410,6 +410,12 @@ def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
 
 
 @njit_fast
+def _bounded(score: np.float32) -> np.float32:
+    """Return the score, or `_NEVER` for minus infinity."""
+    return _NEVER if score < _NEVER else score
+
+
+@njit_fast
 def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array) -> None:
     """Copy a part of an image's scores so that the scores of each pixel are adjacent.
 
@@ -428,8 +434,7 @@ def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array)
         for k in range(num_classes):
             line, source = lines[k], scores[k, top + y]
             for x in range(np.uint64(width)):
-                score = source[np.uint64(left) + x]
-                line[x] = _NEVER if score < _NEVER else score
+                line[x] = _bounded(source[np.uint64(left) + x])
         if softmax:
             _softmax_lines(lines, highest, factor)
         for k in range(np.uint64(num_classes)):
@@ -692,8 +697,9 @@ def _interpolated_classes(
         plane, label = scores[k].reshape(-1), np.int32(k)
         for p in range(np.uint64(count)):
             at = np.uint64(buffers.first[p])
-            score = buffers.a[p] * plane[at] + buffers.b[p] * plane[at + right]
-            score += buffers.c[p] * plane[at + below] + buffers.d[p] * plane[at + below + right]
+            c, d = _bounded(plane[at + below]), _bounded(plane[at + below + right])
+            score = buffers.a[p] * _bounded(plane[at]) + buffers.b[p] * _bounded(plane[at + right])
+            score += buffers.c[p] * c + buffers.d[p] * d
             better = score > highest[p]
             best[p] = label if better else best[p]
             highest[p] = score if better else highest[p]
