@@ -30,7 +30,6 @@ from datamodules.cityscapes import CLASSES, class_maps
 from datamodules.core.data_module import data_set
 from datamodules.core.files import ImageFiles, Split
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from tangent_train.io.image_files import glob_files
 
@@ -50,12 +49,8 @@ class DensePASS(PanoramaDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, range(19), strict=True)), [255]))
     no_depth = "DensePASS has no depth images"
-    get_it = (
-        "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the "
-        "folder with leftImg8bit and gtFine."
-    )
+    get_it = "Get DensePASS from https://github.com/chma1024/DensePASS."
 
-    inputs: Sequence[Input] = ("rgb",)
     horizon_row: Annotated[float, Field(ge=0, le=_HEIGHT)] = _HEIGHT / 2
 
     def __post_init__(self) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.geometry import ray_lengths
 from tangent_train.rendering.resampling import resize
+
+_Depth = TypeVar("_Depth", np.uint16, np.float32)
 
 STEPS_PER_M = 512
 """Steps of depth per meter."""
@@ -17,13 +20,13 @@ MOST_STEPS = np.iinfo(np.uint16).max
 """Largest distance in 16 bits, about 128 m."""
 
 
-def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
+def resize_depth(depth: NDArray[_Depth], shape: tuple[int, ...]) -> NDArray[_Depth]:
     """Downsample raw depth ``(H, W)``, 0 where missing, without mixing values.
 
     Like the nearest pixel, but where the center pixel is missing, the nearest valid pixel within
     the area of the target pixel is taken.
     """
-    small = resize(depth, shape, "nearest")
+    small = resize(depth, (shape[0], shape[1]), "nearest")
     holes = np.array(np.nonzero(small == 0))
     size = np.array([depth.shape]).T
     scale = size / np.array([shape]).T
@@ -39,12 +42,6 @@ def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[n
         small[tuple(holes[:, better])] = value[better]
         nearest[better] = distance[better]
     return small
-
-
-def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Convert depth in steps of 1/512 m to meters, float32, NaN where missing."""
-    meters = steps.astype(np.float32) / np.float32(STEPS_PER_M)
-    return np.where(steps == 0, np.float32(np.nan), meters)
 
 
 def meters_to_steps(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:

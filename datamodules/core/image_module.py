@@ -105,9 +105,10 @@ class ImageDataModule(DataModule):
     no_depth: ClassVar[str] = ""
     no_distances: ClassVar[str] = ""
     fact_settings: ClassVar[tuple[str, ...]] = ("unknown",)
+    cache_settings: ClassVar[tuple[str, ...]] = ("read_shape", "unknown", "labels", "label_map")
 
     labels: Literal["pixel_classes", "distance"] = "pixel_classes"  # type: ignore[misc]
-    inputs: Sequence[Input] = ("rgb", "depth")
+    inputs: Sequence[Input] = ("rgb",)
     color_jitter: Annotated[float, Field(ge=0, le=1)] = 0.0
     classes: str | int | None = None
     unknown: Unknown = "labels"
@@ -231,11 +232,6 @@ class ImageDataModule(DataModule):
     @abstractmethod
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """Refuse an image whose rows and columns do not suit the settings."""
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        settings = {"shape": self.read_shape, "unknown": self.unknown, "labels": self.labels}
-        return {**super().decode_settings(), **settings, "label map": repr(self.label_map)}
 
     def inspect(self, files: ImageFiles, item: Image) -> tuple[NDArray[np.int64], str]:
         """See `DataModule`; of distances that are probably in other units is warned."""

@@ -62,10 +62,6 @@ coarse around 1, and OpenCV does not sample it.
 """
 
 _PER_PROCESS = 40
-_GET_IT = (
-    "Get ModelNet40.zip from https://modelnet.cs.princeton.edu and name the unpacked folder in "
-    "data.root. Or choose data=synthshapes, which needs no download."
-)
 
 
 class ShapeFile(NamedTuple):
@@ -182,9 +178,10 @@ class ModelNet40(DataModule):
     kind = Spheres
     samples = ShapeDataset
     default_level = 5
-    get_it = _GET_IT
+    get_it = "Get it from https://modelnet.cs.princeton.edu, or choose data=synthshapes."
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
+    cache_settings = ("erp_height",)
 
     batch_size: PositiveInt = 16
     test_rotation: Literal["yaw", "so3"] | None = None
@@ -220,10 +217,6 @@ class ModelNet40(DataModule):
         shape = self.erp_height, 2 * self.erp_height
         values = mesh_spheres(read_mesh(files.path), shape)
         return Spheres(np.rint(values * STEPS).astype(np.uint16))
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        return {**super().decode_settings(), "height": self.erp_height}
 
     def in_parallel(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Generator[Any]:
         """See `DataModule`: in processes, because reading meshes holds the GIL."""

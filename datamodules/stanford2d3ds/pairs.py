@@ -19,10 +19,11 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.depth import STEPS_PER_M, meters_to_steps, resize_depth, steps_to_meters
+from datamodules.core.depth import STEPS_PER_M, resize_depth
 from datamodules.core.files import ImageFiles, Problems
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
@@ -121,9 +122,10 @@ class StanfordPairs(PanoramaPairs):
         """See `PanoramaPairs`."""
         path: Any = files.depth
         rgb = read_whole(files.rgb, self.erp_height)
-        depth = resize_depth(meters_to_steps(read_depth_m(path, STEPS_PER_M)), rgb.shape[:2])
+        depth_m = resize_depth(read_depth_m(path, STEPS_PER_M), rgb.shape[:2])
+        depth_m[depth_m == 0] = np.nan
         pose = read_panorama_pose(sibling(files.rgb, "pose.json"))
-        return PairedPanorama(files.name, rgb, files.rgb, steps_to_meters(depth), pose)
+        return PairedPanorama(files.name, rgb, files.rgb, depth_m, pose)
 
 
 def _camera(files: ImageFiles) -> str:

@@ -42,6 +42,7 @@ from scipy.spatial.transform import Rotation
 from datamodules.core.data_module import data_set
 from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
+from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.stanford2d3ds import files as stanford
 from tangent_train.errors import DataError
@@ -49,10 +50,7 @@ from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.image_files import glob_files
 
-GET_IT = (
-    "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
-    "the folder with area_1 … area_6, or train on data=synthrooms, which needs no download."
-)
+GET_IT = "Get Stanford2D3DS from http://buildingparser.stanford.edu, or choose data=synthrooms."
 """Remedy if the data set is missing."""
 
 _NAME = re.compile(
@@ -158,8 +156,10 @@ class StanfordImages(ImageDataModule):
     group: ClassVar[Literal["pano", "data"]]
     get_it = GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("areas",)
+    cache_settings: ClassVar[tuple[str, ...]] = ("_label_table",)
     folds: ClassVar[tuple[int, ...]] = tuple(stanford.FOLDS)
 
+    inputs: Sequence[Input] = ("rgb", "depth")
     fold: Literal[1, 2, 3] = 1
     areas: Sequence[stanford.Area] = stanford.AREAS
     label_table: Path | None = None
@@ -185,17 +185,19 @@ class StanfordImages(ImageDataModule):
         return {"train": train, "val": val, "test": test}
 
     @cached_property
-    def _label_table(self) -> LabelMap:
-        """Label of the color of every instance."""
-        label_map: Any = self.label_map
+    def _label_table(self) -> LabelMap | None:
+        """Label of the color of every instance; None if the labels are distances."""
+        if self.label_map is None:
+            return None
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         path = self.label_table or next(filter(Path.is_file, places), places[0])
-        return read_label_table(path).regrouped(label_map.names)
+        return read_label_table(path).regrouped(self.label_map.names)
 
     def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """See `ImageDataModule`: by the class table."""
-        path: Any = files.labels
-        return self._label_table.read_labels(path)
+        table: Any = self._label_table
+        labels: NDArray[np.uint8] = table.read_labels(files.labels)
+        return labels
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
         """See `ImageDataModule`: by the pose file, if there is one."""
@@ -203,11 +205,6 @@ class StanfordImages(ImageDataModule):
         if not path.is_file():
             return None
         return read_panorama_pose(path) if files.camera is None else read_photo_pose(path)
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        table = "" if self.has_distances else str(self._label_table.labels)
-        return {**super().decode_settings(), "class table": table}
 
 
 @data_set

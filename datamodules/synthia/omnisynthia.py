@@ -27,7 +27,7 @@ from datamodules.core.data_module import data_set
 from datamodules.core.depth import meters_to_steps
 from datamodules.core.files import ImageFiles, Problems, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.inputs import RGBD_NORMALIZATION, Input, Normalization
+from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.label_map import LabelMap
 from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas
@@ -76,7 +76,6 @@ class SynthiaSequences(ImageDataModule):
     get_it = reader.GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
 
-    inputs: Sequence[Input] = ("rgb",)
     train_sequences: Annotated[Sequences, Field(min_length=1)] = ("01", "02", "05", "06")
     test_sequences: Annotated[Sequences, Field(min_length=1)] = ("04",)
     frames: PositiveInt = reader.FRAMES

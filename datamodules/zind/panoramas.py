@@ -49,7 +49,6 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from datamodules.core.data_module import data_set
 from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, read_whole
 from datamodules.zind.homes import GET_IT, HomePanorama, list_home_panoramas
@@ -76,9 +75,8 @@ class Zind(PanoramaDataModule):
     label_maps = {"5": LabelMap.of(CLASSES, [0])}  # noqa: RUF012, never changed
     no_depth = "ZInD has no depth images"
     get_it = GET_IT
-    fact_settings = ("doors",)
+    fact_settings = cache_settings = ("doors",)
 
-    inputs: Sequence[Input] = ("rgb",)
     doors: Literal["class", "ignore"] = "class"
     test_fraction: Annotated[float, Field(gt=0, le=1)] = 0.2
     split_seed: NonNegativeInt = 0
@@ -126,10 +124,6 @@ class Zind(PanoramaDataModule):
         if self.doors == "ignore":
             labels[labels == DOOR] = 0
         return labels
-
-    def decode_settings(self) -> dict[str, object]:
-        """See `DataModule`."""
-        return {**super().decode_settings(), "doors": self.doors}
 
 
 @data_set

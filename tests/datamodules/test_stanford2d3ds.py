@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.depth import distance_from_z_depth, steps_to_meters
+from datamodules.core.depth import distance_from_z_depth
 from datamodules.core.files import SPLITS
 from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS
 from datamodules.stanford2d3ds.panoramas import (
@@ -80,9 +80,7 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
     assert classes.max() > 1
     np.testing.assert_array_equal(panorama.labels, classes)
     known = classes > 0
-    np.testing.assert_array_equal(
-        steps_to_meters(panorama.depth), np.where(known, 1 + (classes - 1) / 4, np.nan)
-    )
+    np.testing.assert_array_equal(panorama.depth, np.where(known, 512 + (classes - 1) * 128, 0))
     np.testing.assert_array_equal(panorama.rgb[..., 0], np.where(known, 5 + 15 * classes, 0))
     np.testing.assert_array_equal(panorama.rgb[..., 1], np.where(known, 245 - 15 * classes, 0))
     assert known.mean() == 7 / 8
