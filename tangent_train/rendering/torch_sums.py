@@ -200,12 +200,12 @@ class TorchSums:
             self._sums = torch.zeros(size, dtype=self._dtype, device=self._device)
         return self._sums
 
-    def unknown(self) -> int:
+    def unknown(self) -> Tensor:
         """Return the number of pixels at which a view has a score that is NaN or infinite."""
         self._finish()
         if self._averaged:
-            return int(self._total()[:, 0].isnan().sum())
-        return int((self._labels == self._channels).sum())
+            return self._total()[:, 0].isnan().sum()
+        return (self._labels == self._channels).sum()
 
     def rows(self, rows: slice | NDArray[np.intp]) -> Tensor:
         """Return the sums ``(h, W, K)`` of some rows."""

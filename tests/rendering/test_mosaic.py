@@ -152,7 +152,7 @@ def test_scores_that_are_not_finite_make_all_pixels_unknown_that_depend_on_them(
     _added(result, scores.double(), grid)  # networks may compute in float64
     labels = _labels(result)
     np.testing.assert_array_equal(labels, np.where(spoiled, 7, expected))
-    assert result.not_finite == pytest.approx(spoiled.mean())
+    assert float(result.not_finite) == pytest.approx(spoiled.mean())
     if averaged or blend == "feather":
         assert (_probabilities(result).sum(axis=-1) > 0.99).tolist() == (~spoiled).tolist()
     given = scores.softmax(1) if blend == "feather" else scores
