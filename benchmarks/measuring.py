@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 
 from datamodules.core.inputs import RGB_NORMALIZATION
@@ -27,6 +28,8 @@ from tangent_train.checkpoints.loaded import LoadedNetwork
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 """Device of the GPU benchmarks."""
+
+ON_GPU = DEVICE.type == "cuda"
 
 FAILURES: list[str] = []
 """Failed benchmarks with their errors."""
@@ -198,3 +201,12 @@ def attempted(name: str) -> Iterator[None]:
     finally:
         gc.collect()
         torch.cuda.empty_cache()
+
+
+def busy_s(profiler: Any) -> float:
+    """Return the seconds in which at least one kernel or copy ran."""
+    events = [e for e in profiler.events() if e.device_type.name.lower() == DEVICE.type]
+    events = [event for event in events if not getattr(event, "is_user_annotation", False)]
+    start, end = np.array(sorted((e.time_range.start, e.time_range.end) for e in events)).T
+    until = np.maximum.accumulate(np.append(0, end[:-1]))
+    return float(np.maximum(0, end - np.maximum(start, until)).sum()) / 1e6
