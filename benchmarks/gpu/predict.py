@@ -75,7 +75,7 @@ def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
         return [part for _, part in parts]
 
     def labeled(predictor: Predictor) -> None:
-        trained.labels(predictor.predict(image).labels())
+        predictor.predict(image).pixels().cpu()
 
     alternatives = [
         Alternative("the network", lambda: scores(lambda part: random[: part.stop - part.start]))

@@ -106,22 +106,6 @@ class Task(lightning.LightningModule, ABC):
         self._pending: tuple[Tensor, Any, Any] | None = None
         self._step_norm: Any = None
 
-    @classmethod
-    def load_from_checkpoint(cls, checkpoint_path: Any, *arguments: Any, **named: Any) -> Self:
-        """Load a checkpoint into a task of the given network, representation and head.
-
-        Raises:
-            SettingError: They are not given.
-        """
-        if "network" not in named:
-            raise SettingError(
-                f"{cls.__name__}.load_from_checkpoint",
-                found="no network=",
-                expected="network, representation, head and optimizer of the run",
-                remedy="tt.load(checkpoint) builds the network from the checkpoint alone.",
-            )
-        return super().load_from_checkpoint(checkpoint_path, *arguments, **named)
-
     @abstractmethod
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
         """Return the inputs of the network and their targets, with a common first dimension."""
