@@ -6,7 +6,6 @@ import json
 from collections.abc import Collection, Mapping
 from functools import cached_property
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -222,16 +221,11 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
     Raises:
         DataError: The file is missing, has other content, names classes that are not allowed, or
             its network cannot be built; or a package to read it is missing.
-        SettingError: A trusted package is missing.
     """
     try:
         checked_file(path)
     except OSError as error:
         raise DataError(path, found=error, expected=_EXPECTED) from error
-    for name in trust:
-        if not name or find_spec(name.partition(".")[0]) is None:
-            expected = "a package that is installed, or a module or class in it"
-            raise SettingError("trust", found=name, expected=expected)
     onnx = OnnxNetwork(path) if path.suffix.lower() == ".onnx" else None
     if onnx is None:
         described = read_description(path)

@@ -342,14 +342,13 @@ class PixelTask(Task):
         found = tuple(outputs["out"].shape)
         expected = (len(images), self.head.num_outputs, *images.shape[-2:])
         if found != expected:
-            name, remedy = "output of the network", ""
-            if found[2:] != expected[2:]:
-                remedy = (
-                    "A network returns a score for every pixel of its input: enlarge its output."
-                )
-            elif found[1:2] != expected[1:2]:
-                remedy = "Set network.num_classes to the number of classes, or to null."
-            raise SettingError(name, found=found, expected=expected, remedy=remedy)
+            remedy = (
+                "A network returns the scores of all classes (network.num_classes, or null for "
+                "those of the data) for every pixel of its input."
+            )
+            raise SettingError(
+                "output of the network", found=found, expected=expected, remedy=remedy
+            )
         return outputs
 
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
