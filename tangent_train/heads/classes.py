@@ -19,7 +19,7 @@ from torch.nn.functional import cross_entropy, pad
 
 from datamodules.core.label_map import IMAGE_CLASS, PIXEL_CLASSES, ClassWeights
 from tangent_train.heads import pictures
-from tangent_train.heads.base import NOTHING, RGB, Head, PredictedImage, Scores
+from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
 from tangent_train.io.palette import class_colors
 from tangent_train.io.pixel_files import array_file, read_pixels
 from tangent_train.metrics import segmentation
@@ -245,20 +245,18 @@ class ClassesHead(Head):
         listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
         return f"Smallest confidence of each class: {listed}."
 
-    def predicted(
-        self, mosaic: Any, image: Any, files: Mapping[str, Path] = NOTHING
-    ) -> PredictedImage:
-        """Return the labels of an image; write the probabilities, which take much memory."""
-        if "probabilities" in files:
-            everywhere = np.arange(mosaic.shape[0]), np.arange(mosaic.shape[1])
-            rows, columns = everywhere if image.area is None else image.area.places()
-            shape = (len(rows), len(columns), len(self.class_names) - 1)
-            with array_file(files["probabilities"], shape, np.float16) as array:
-                for start in range(0, len(rows), _ROWS_AT_ONCE):
-                    part = slice(start, start + _ROWS_AT_ONCE)
-                    probabilities = mosaic.probabilities(rows[part]).cpu().numpy()
-                    array[part] = probabilities[:, columns, : shape[-1]]
-        return super().predicted(mosaic, image, files)
+    def write_mosaic(self, mosaic: Any, image: Any, files: Mapping[str, Path]) -> None:
+        """Write the probabilities of an image, which take much memory."""
+        if "probabilities" not in files:
+            return
+        everywhere = np.arange(mosaic.shape[0]), np.arange(mosaic.shape[1])
+        rows, columns = everywhere if image.area is None else image.area.places()
+        shape = (len(rows), len(columns), len(self.class_names) - 1)
+        with array_file(files["probabilities"], shape, np.float16) as array:
+            for start in range(0, len(rows), _ROWS_AT_ONCE):
+                part = slice(start, start + _ROWS_AT_ONCE)
+                probabilities = mosaic.probabilities(rows[part]).cpu().numpy()
+                array[part] = probabilities[:, columns, : shape[-1]]
 
     def read(self, file: Path) -> NDArray[Any]:
         """Read labels."""
@@ -323,10 +321,9 @@ class LabelMosaic(ScoreMosaic):
         self._head, self.valid = head, valid
 
     @property
-    def facts(self) -> Mapping[str, float]:
-        """The share of pixels without a class, see `ScoreMosaic.not_finite`, if there are any."""
-        share = self.not_finite
-        return {"not_finite": share} if share else NOTHING
+    def facts(self) -> Mapping[str, Tensor]:
+        """The share of pixels without a class, see `ScoreMosaic.not_finite`."""
+        return {"not_finite": self.not_finite}
 
     def pixels(self) -> Tensor:
         """Return labels ``(H, W)``, 0 where unknown."""
