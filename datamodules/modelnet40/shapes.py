@@ -147,8 +147,8 @@ class ShapeDataset(SplitDataset):
 
     def shape_rotation(self, index: int) -> NDArray[np.float64]:
         """Return the rotation R of a test shape, ``(3, 3)``: point x moves to R x."""
-        rotation = "so3" if self.data.test_rotation == "so3" else 0
-        return draw_rotation(rotation, self.data.seed, index)
+        is_yaw = self.data.test_rotation == "yaw"
+        return draw_rotation(0 if is_yaw else "so3", self.data.seed, index)
 
 
 @data_set
