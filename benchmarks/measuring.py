@@ -152,6 +152,7 @@ def tangent_network(level: int, widths: Sequence[int]) -> LoadedNetwork:
         level=level,
         representation={"_target_": target, "base_level": 0, "level": level},
         image_size=(2**level, 2**level),
+        size_multiple=2 ** (len(widths) - 1),
         settings={"_target_": "models.UNet", **settings},
     )
 

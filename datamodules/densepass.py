@@ -34,7 +34,6 @@ from datamodules.core.label_map import LabelMap
 from tangent_train.io.image_files import glob_files
 
 _HEIGHT, _WIDTH = 400, 2048
-_LABELS = "_labelTrainIds.png"
 
 
 @data_set
@@ -64,7 +63,6 @@ class DensePASS(PanoramaDataModule):
         images, labels = (self.root / kind / "val" / "cs" for kind in ("leftImg8bit", "gtFine"))
         # Two spellings are in circulation: 1_.png and 1.png.
         paths = {path.stem.removesuffix("_"): path for path in glob_files(images, "*.png")}
-        test = [ImageFiles(n, paths[n], labels / f"{n}{_LABELS}") for n in sorted(paths)]
+        test = [ImageFiles(n, paths[n], labels / f"{n}_labelTrainIds.png") for n in sorted(paths)]
         self.problems.compare_counts({"test": test}, {"test": 100})
-        self.problems.note_strays(glob_files(labels, f"*{_LABELS}"), test)
         return {"test": test}

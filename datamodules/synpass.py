@@ -99,15 +99,12 @@ class SynPASS(PanoramaDataModule):
     def _list_images(self, split: Split) -> list[ImageFiles]:
         """Return the images of a folder, each with the label image of its name."""
         found: list[ImageFiles] = []
-        labels: list[Path] = []
         chosen = [self.weather] if isinstance(self.weather, str) else self.weather
         for weather in ("cloud", "fog", "rain", "sun") if "all" in chosen else chosen:
             place = Path(weather, split)
-            labels += glob_files(self.root / "semantic" / place, "*/*_trainID.png")
             for rgb in glob_files(self.root / "img" / place, "*/*.jpg"):
                 mask = self.root / "semantic" / place / rgb.parent.name / f"{rgb.stem}_trainID.png"
                 found.append(ImageFiles(f"{rgb.parent.name}/{weather}/{rgb.stem}", rgb, mask))
-        self.problems.note_strays(labels, found)
         return found
 
     @cached_property

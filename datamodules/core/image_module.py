@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from datamodules.core.data_module import DataModule, data_set
-from datamodules.core.dataset import Image, ImageDataset, Labels, sample_rng
+from datamodules.core.dataset import Image, ImageDataset, Labels, draw_rotation
 from datamodules.core.depth import (
     MOST_STEPS,
     STEPS_PER_M,
@@ -35,7 +35,7 @@ from datamodules.core.inputs import (
 )
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES, UNKNOWN_NAME, LabelMap
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.geometry import PanoramaPose, random_rotation, rotation_about, shift_range
+from tangent_train.geometry import PanoramaPose, shift_range
 from tangent_train.geometry.sphere import check_area
 from tangent_train.io.gpano import (
     Fill,
@@ -453,22 +453,6 @@ def mask_black(labels: Labels, rgb: NDArray[np.uint8], unknown: Unknown) -> Labe
         return labels
     black = rgb == 0
     return np.where(black.any(-1) if unknown == "any_black" else black.all(-1), np.uint8(0), labels)
-
-
-def draw_rotation(rotation: float | Literal["so3"], seed: int, index: int) -> NDArray[np.float64]:
-    """Draw the rotation R of a test panorama, ``(3, 3)``: direction d moves to R d.
-
-    Args:
-        rotation: See `PanoramaDataModule.test_rotation`.
-        seed: Seed of the run.
-        index: Index of the panorama.
-    """
-    rng = sample_rng(seed, 0, index)
-    if rotation == "so3":
-        return random_rotation(rng)
-    yaw, azimuth = rng.uniform(0, 2 * math.pi, 2)
-    tilt = rotation_about((math.cos(azimuth), math.sin(azimuth), 0), math.radians(rotation))
-    return tilt @ rotation_about((0, 0, 1), yaw)
 
 
 def _changed(

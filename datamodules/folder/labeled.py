@@ -103,8 +103,10 @@ class LabeledFolder(ImageDataModule):
         """Warn of files that training passes over: labels of no image, and no images."""
         names = {files.name for files in images}
         folder = self.root / ("depth" if self.has_distances else "labels")
-        paths = list(image_files.walk_files(folder))
-        self.problems.note_absent(str(folder), {_name(folder, path) for path in paths} - names)
+        strays = sorted({_name(folder, path) for path in image_files.walk_files(folder)} - names)
+        if strays:
+            found = f"{len(strays)} without an image, e.g. {repr(strays[0])[1:-1]}"
+            self.problems.warnings.append(f"{folder}: {found}")
         folder = self.root / "images"
         others = {*image_files.walk_files(folder)} - {files.rgb for files in images}
         suffixes = {path.suffix.lower() for path in others}

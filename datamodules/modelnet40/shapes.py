@@ -17,7 +17,6 @@ The class is the folder, or the name of the file without its number. Other files
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -29,12 +28,11 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from datamodules.core.data_module import DataModule, data_set
-from datamodules.core.dataset import SplitDataset, sample_rng
+from datamodules.core.dataset import SplitDataset, draw_rotation
 from datamodules.core.files import SPLITS, Split, draw_groups
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.label_map import IMAGE_CLASS
 from datamodules.modelnet40.meshes import CHANNELS, mesh_spheres, read_mesh
-from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.io.image_files import glob_files
 from tangent_train.threads import in_processes
 
@@ -149,10 +147,8 @@ class ShapeDataset(SplitDataset):
 
     def shape_rotation(self, index: int) -> NDArray[np.float64]:
         """Return the rotation R of a test shape, ``(3, 3)``: point x moves to R x."""
-        rng = sample_rng(self.data.seed, 0, index)
-        if self.data.test_rotation == "so3":
-            return random_rotation(rng)
-        return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
+        is_yaw = self.data.test_rotation == "yaw"
+        return draw_rotation(0 if is_yaw else "so3", self.data.seed, index)
 
 
 @data_set

@@ -35,13 +35,13 @@ from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, ray_lengths, xyz_to_lonlat
+from tangent_train.geometry.sphere import Floats
 from tangent_train.kinds import Align, DepthKind
 from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.tensors import on_device
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 RAY_POWERS: dict[str, int] = {

@@ -13,7 +13,8 @@ import torch
 from numpy.typing import NDArray
 
 from datamodules.cityscapes import Cityscapes
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule, draw_rotation
+from datamodules.core.dataset import draw_rotation
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.folder.labeled import FolderPanoramas
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
