@@ -17,12 +17,19 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+
+from datamodules.core.inputs import RGB_NORMALIZATION
+from models import UNet
+from tangent_train.checkpoints.loaded import LoadedNetwork
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 """Device of the GPU benchmarks."""
+
+ON_GPU = DEVICE.type == "cuda"
 
 FAILURES: list[str] = []
 """Failed benchmarks with their errors."""
@@ -132,6 +139,24 @@ def measure(alternatives: Sequence[Alternative], rounds: int) -> list[Row]:
     return rows
 
 
+def tangent_network(level: int, widths: Sequence[int]) -> LoadedNetwork:
+    """Return an untrained UNet of 13 classes for tangent images of b = 0."""
+    torch.manual_seed(0)
+    settings: dict[str, Any] = {"in_channels": 3, "num_classes": 13, "widths": widths}
+    target = "tangent_train.rendering.TangentRepresentation"
+    return LoadedNetwork(
+        module=UNet(**settings).eval(),
+        class_names=("unknown", *map(str, range(13))),
+        inputs=("rgb",),
+        normalization=RGB_NORMALIZATION,
+        level=level,
+        representation={"_target_": target, "base_level": 0, "level": level},
+        image_size=(2**level, 2**level),
+        size_multiple=2 ** (len(widths) - 1),
+        settings={"_target_": "models.UNet", **settings},
+    )
+
+
 def expect_agreement(name: str, share: float, least: float) -> None:
     """Refuse a comparison of different results.
 
@@ -177,3 +202,12 @@ def attempted(name: str) -> Iterator[None]:
     finally:
         gc.collect()
         torch.cuda.empty_cache()
+
+
+def busy_s(profiler: Any) -> float:
+    """Return the seconds in which at least one kernel or copy ran."""
+    events = [e for e in profiler.events() if e.device_type.name.lower() == DEVICE.type]
+    events = [event for event in events if not getattr(event, "is_user_annotation", False)]
+    start, end = np.array(sorted((e.time_range.start, e.time_range.end) for e in events)).T
+    until = np.maximum.accumulate(np.append(0, end[:-1]))
+    return float(np.maximum(0, end - np.maximum(start, until)).sum()) / 1e6

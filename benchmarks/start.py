@@ -12,12 +12,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
-from benchmarks.measuring import Goal, Row, Table
-from datamodules.core.inputs import RGB_NORMALIZATION
-from models import UNet
-from tangent_train.checkpoints.loaded import LoadedNetwork
+from benchmarks.measuring import Goal, Row, Table, tangent_network
 from tangent_train.geometry import equirect_shape
 from tangent_train.inference.export import export_network
 
@@ -34,7 +30,7 @@ def start(quick: bool) -> Iterator[Table]:
         folder = Path(name)
         level = 4 if quick else 8
         cv2.imwrite(str(folder / "pano.png"), np.zeros((*equirect_shape(level), 3), np.uint8))
-        _write_network(folder / "net.safetensors", level)
+        export_network(tangent_network(level, (8, 16)), folder / "net.safetensors")
         lines = {
             IMAGES: IMAGES,
             TORCH: TORCH,
@@ -82,24 +78,3 @@ def _cpu_seconds(code: str, folder: Path, number: int) -> float:
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
-def _write_network(path: Path, level: int) -> None:
-    torch.manual_seed(0)
-    side, widths = 2**level, (8, 16)
-    trained = LoadedNetwork(
-        module=UNet(3, 13, widths).eval(),
-        class_names=("unknown", *map(str, range(13))),
-        inputs=("rgb",),
-        normalization=RGB_NORMALIZATION,
-        level=level,
-        representation={
-            "_target_": "tangent_train.rendering.TangentRepresentation",
-            "base_level": 0,
-            "level": level,
-        },
-        image_size=(side, side),
-        size_multiple=2,
-        settings={"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths": widths},
-    )
-    export_network(trained, path)

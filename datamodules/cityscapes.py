@@ -31,7 +31,6 @@ from pydantic import BaseModel, Field, PositiveFloat
 from datamodules.core.data_module import data_set
 from datamodules.core.files import ImageFiles, Split
 from datamodules.core.image_module import PhotoDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov
@@ -89,13 +88,10 @@ class Cityscapes(PhotoDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, _IDS, strict=True)), _UNKNOWN))
     no_depth = "disparities are not read"
-    get_it = (
-        "Get leftImg8bit, gtFine and camera (…_trainvaltest.zip) from "
-        "https://www.cityscapes-dataset.com and point data.root at the folder that holds them."
-    )
+    get_it = "Get leftImg8bit, gtFine and camera from https://www.cityscapes-dataset.com."
     test_split = "val"
+    cache_settings = ("fov",)
 
-    inputs: Sequence[Input] = ("rgb",)
     fov: Annotated[float, Field(gt=0, lt=180)] | None = None
 
     def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
@@ -110,8 +106,6 @@ class Cityscapes(PhotoDataModule):
                 )
                 name = f"{city}/{stem.removeprefix(f'{city}_')}"
                 found.append(ImageFiles(name, rgb, labels, None, None if self.fov else camera))
-            every = glob_files(self.root, f"gtFine/{split}/*/*_labelIds.png")
-            self.problems.note_strays(every, found)
         self.problems.compare_counts(published, {"train": 2975, "val": 500})
         return published
 
@@ -122,7 +116,3 @@ class Cityscapes(PhotoDataModule):
         remedy = "data.fov=48.7 replaces the camera files."
         camera = read_json(files.camera, _CAMERA, remedy, kind=_CameraFile).intrinsic
         return np.array([[camera.fx, 0, camera.u0], [0, camera.fy, camera.v0], [0, 0, 1]])
-
-    def decode_settings(self) -> dict[str, object]:
-        """See `DataModule`."""
-        return {**super().decode_settings(), "fov": self.fov}

@@ -30,12 +30,10 @@ from datamodules.cityscapes import CLASSES, class_maps
 from datamodules.core.data_module import data_set
 from datamodules.core.files import ImageFiles, Split
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from tangent_train.io.image_files import glob_files
 
 _HEIGHT, _WIDTH = 400, 2048
-_LABELS = "_labelTrainIds.png"
 
 
 @data_set
@@ -50,12 +48,8 @@ class DensePASS(PanoramaDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, range(19), strict=True)), [255]))
     no_depth = "DensePASS has no depth images"
-    get_it = (
-        "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the "
-        "folder with leftImg8bit and gtFine."
-    )
+    get_it = "Get DensePASS from https://github.com/chma1024/DensePASS."
 
-    inputs: Sequence[Input] = ("rgb",)
     horizon_row: Annotated[float, Field(ge=0, le=_HEIGHT)] = _HEIGHT / 2
 
     def __post_init__(self) -> None:
@@ -69,7 +63,6 @@ class DensePASS(PanoramaDataModule):
         images, labels = (self.root / kind / "val" / "cs" for kind in ("leftImg8bit", "gtFine"))
         # Two spellings are in circulation: 1_.png and 1.png.
         paths = {path.stem.removesuffix("_"): path for path in glob_files(images, "*.png")}
-        test = [ImageFiles(n, paths[n], labels / f"{n}{_LABELS}") for n in sorted(paths)]
+        test = [ImageFiles(n, paths[n], labels / f"{n}_labelTrainIds.png") for n in sorted(paths)]
         self.problems.compare_counts({"test": test}, {"test": 100})
-        self.problems.note_strays(glob_files(labels, f"*{_LABELS}"), test)
         return {"test": test}

@@ -32,7 +32,6 @@ from typing import ClassVar, Literal
 from datamodules.core.data_module import data_set
 from datamodules.core.files import SPLITS, ImageFiles, Split
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.tables import read_table
 from tangent_train.io.image_files import glob_files
@@ -90,14 +89,11 @@ class Matterport360(PanoramaDataModule):
     }
     units_per_m = 4000
     get_it = (
-        "Request Matterport3D at https://niessner.github.io/Matterport and its panoramas from "
-        "360BEV (https://github.com/jamycheung/360BEV) or SFSS-MMSI "
-        "(https://github.com/sguttikon/SFSS-MMSI), and point data.root at the folder of the "
-        "scenes."
+        "Request Matterport3D at https://niessner.github.io/Matterport, and its panoramas from "
+        "https://github.com/jamycheung/360BEV or https://github.com/sguttikon/SFSS-MMSI."
     )
     fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
 
-    inputs: Sequence[Input] = ("rgb",)
     release: Literal["360fv", "sfss"] = "360fv"
     test_split: Literal["test", "val"] = "test"  # type: ignore[misc]
 

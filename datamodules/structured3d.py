@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 from datamodules.core.data_module import data_set
 from datamodules.core.files import SPLITS, ImageFiles, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.stanford2d3ds.files import EIGHT
 from tangent_train.io.image_files import glob_files
@@ -103,16 +102,12 @@ class Structured3DImages(ImageDataModule):
         "published_s3d8": PublishedS3D8(_EIGHT.names, _EIGHT.labels),
     }
     units_per_m = 1000
-    get_it = (
-        "Request Structured3D at https://structured3d-dataset.org and point data.root at the "
-        "folder with scene_00000 and the others."
-    )
+    get_it = "Request Structured3D at https://structured3d-dataset.org."
     place: ClassVar[str]
     fact_settings: ClassVar[tuple[str, ...]] = (
         *("configuration", "lighting", "invalid_scenes", "test_split"),
     )
 
-    inputs: Sequence[Input] = ("rgb",)
     configuration: Literal["full", "simple", "empty"] = "full"
     lighting: Literal["rawlight", "warmlight", "coldlight"] = "rawlight"
     invalid_scenes: Literal["keep", "leave_out"] = "keep"

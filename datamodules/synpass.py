@@ -33,7 +33,6 @@ from datamodules.cityscapes import THIRTEEN
 from datamodules.core.data_module import data_set
 from datamodules.core.files import SPLITS, ImageFiles, Split
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from tangent_train.io.image_files import glob_files
 
@@ -74,13 +73,9 @@ class SynPASS(PanoramaDataModule):
         "13": _TWENTY_TWO.regrouped(THIRTEEN, _MERGED),
     }
     no_depth = "SynPASS has no depth images"
-    get_it = (
-        "Get SynPASS as https://github.com/jamycheung/Trans4PASS describes and point data.root at"
-        " the folder with img and semantic."
-    )
+    get_it = "Get SynPASS from https://github.com/jamycheung/Trans4PASS."
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
-    inputs: Sequence[Input] = ("rgb",)
     weather: Literal["all"] | Weather | Annotated[Sequence[Weather], Field(min_length=1)] = "all"
     time: Literal["all", "day", "night"] = "all"
     test_split: Literal["test", "val"] = "test"  # type: ignore[misc]
@@ -104,15 +99,12 @@ class SynPASS(PanoramaDataModule):
     def _list_images(self, split: Split) -> list[ImageFiles]:
         """Return the images of a folder, each with the label image of its name."""
         found: list[ImageFiles] = []
-        labels: list[Path] = []
         chosen = [self.weather] if isinstance(self.weather, str) else self.weather
         for weather in ("cloud", "fog", "rain", "sun") if "all" in chosen else chosen:
             place = Path(weather, split)
-            labels += glob_files(self.root / "semantic" / place, "*/*_trainID.png")
             for rgb in glob_files(self.root / "img" / place, "*/*.jpg"):
                 mask = self.root / "semantic" / place / rgb.parent.name / f"{rgb.stem}_trainID.png"
                 found.append(ImageFiles(f"{rgb.parent.name}/{weather}/{rgb.stem}", rgb, mask))
-        self.problems.note_strays(labels, found)
         return found
 
     @cached_property

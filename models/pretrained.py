@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.errors import DataError, SettingError, first_line, printable
 from tangent_train.files import load_plain
 
 _RGB = 3
@@ -126,12 +126,6 @@ def fetch_tensors(weights: str) -> dict[str, Tensor]:
     )
 
 
-def first_difference(error: Exception) -> str:
-    """Return the first difference that torch lists below the title of its message."""
-    lines = str(error).splitlines()
-    return (lines[1] if len(lines) > 1 else str(error)).strip()
-
-
 def load_tensors(
     network: nn.Module, tensors: Mapping[str, Tensor], source: object, fresh: str | None = None
 ) -> None:
@@ -154,8 +148,11 @@ def load_tensors(
     try:
         network.load_state_dict({**kept, **tensors})
     except (RuntimeError, TypeError, AttributeError) as error:
+        # torch lists the differences below the title of its message.
+        title, _, differences = str(error).partition("\n")
+        found = first_line(differences or title)
         expected = f"all tensors of {type(network).__name__}, for the same classes and settings"
-        raise DataError(source, found=first_difference(error), expected=expected) from error
+        raise DataError(source, found=found, expected=expected) from error
 
 
 def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:

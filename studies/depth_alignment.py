@@ -93,7 +93,7 @@ def depth_alignment(
         truths.append(truth)
     points = sphere_points(shape)
     samples = [
-        sample_views(output[:, 0].numpy(), part, shape, points)
+        sample_views(output, part, shape, points)
         for output, part in zip(outputs, views, strict=True)
     ]
     row: Row = {"output": kind, "smooth error %": 100 * smooth_error}

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,40 +42,6 @@ def run_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str
         capture_output=True,
         text=True,
     )
-
-
-def further_processes(first: int) -> list[int]:
-    """Processes of a run that its first one has started."""
-    children = Path(f"/proc/{first}/task/{first}/children").read_text().split()
-    return [int(number) for number in children if b"LOCAL_RANK=1" in _environment(number)]
-
-
-def _environment(number: str) -> bytes:
-    try:
-        return Path(f"/proc/{number}/environ").read_bytes()
-    except (FileNotFoundError, ProcessLookupError):  # it has just ended
-        return b""
-
-
-def has_ended(process: int) -> bool:
-    """True if a process is gone, or only waits for its parent to notice."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return True
-
-
-def wait_for(done: Callable[[], object], seconds: float = 60.0) -> None:
-    """Wait until something is true.
-
-    Raises:
-        TimeoutError: It is not in time.
-    """
-    end = time.monotonic() + seconds
-    while not done():
-        if time.monotonic() > end:
-            raise TimeoutError
-        time.sleep(0.02)
 
 
 def command_of(experiment: str) -> str:

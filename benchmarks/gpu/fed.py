@@ -11,21 +11,19 @@ from itertools import repeat
 from typing import Any
 
 import lightning
-import numpy as np
 import torch
 from lightning.fabric.utilities import move_data_to_device
 from lightning.pytorch.callbacks import Callback
 from torch.profiler import ProfilerActivity, profile
 
-from benchmarks.measuring import DEVICE, Goal, Row, Table, attempted
+from benchmarks.measuring import DEVICE, ON_GPU, Goal, Row, Table, attempted, busy_s
 from benchmarks.training import built, quiet
 from datamodules.core.dataset import Sample
 from datamodules.core.inputs import normalize
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.rendering import equirect_to_tangent
 
-_ON_GPU = DEVICE.type == "cuda"
-_WARM, _TIMED, _PROFILED = (8, 30, 10) if _ON_GPU else (1, 2, 1)
+_WARM, _TIMED, _PROFILED = (8, 30, 10) if ON_GPU else (1, 2, 1)
 
 
 def fed(quick: bool) -> Iterator[Table]:
@@ -70,7 +68,7 @@ def _fit(task: Any, workers: int = 0, **given: Any) -> tuple[float, float]:
         trainer = lightning.Trainer(
             accelerator="auto",
             devices=1,
-            precision="bf16-mixed" if _ON_GPU else "32-true",
+            precision="bf16-mixed" if ON_GPU else "32-true",
             max_steps=_WARM + _TIMED + _PROFILED,
             max_epochs=-1,
             callbacks=[clock, ProgressBar()],
@@ -88,7 +86,7 @@ class _Clock(Callback):
     """Times some steps after a warm-up, then profiles some."""
 
     def __init__(self) -> None:
-        kind = ProfilerActivity.CUDA if _ON_GPU else ProfilerActivity.CPU
+        kind = ProfilerActivity.CUDA if ON_GPU else ProfilerActivity.CPU
         self._profiler = profile(activities=[kind])
         self._start = self.step_s = self.busy = 0.0
 
@@ -97,7 +95,7 @@ class _Clock(Callback):
         step = trainer.global_step
         if step not in (_WARM, _WARM + _TIMED, _WARM + _TIMED + _PROFILED):
             return
-        if _ON_GPU:
+        if ON_GPU:
             torch.cuda.synchronize()
         now = time.perf_counter()
         if step == _WARM + _TIMED:
@@ -105,17 +103,8 @@ class _Clock(Callback):
             self._profiler.start()
         elif step > _WARM:
             self._profiler.stop()
-            self.busy = 100 * _union_s(self._profiler) / (now - self._start)
+            self.busy = 100 * busy_s(self._profiler) / (now - self._start)
         self._start = time.perf_counter()
-
-
-def _union_s(profiler: Any) -> float:
-    """Return the seconds in which at least one kernel or copy ran."""
-    events = [e for e in profiler.events() if e.device_type.name.lower() == DEVICE.type]
-    events = [event for event in events if not getattr(event, "is_user_annotation", False)]
-    start, end = np.array(sorted((e.time_range.start, e.time_range.end) for e in events)).T
-    until = np.maximum.accumulate(np.append(0, end[:-1]))
-    return float(np.maximum(0, end - np.maximum(start, until)).sum()) / 1e6
 
 
 def _rendered(data: Any, count: int) -> Iterator[Any]:
@@ -124,7 +113,7 @@ def _rendered(data: Any, count: int) -> Iterator[Any]:
     for k in range(count):
         image = data.dataset("train").read(k)
         parts = map(torch.tensor, (image.rgb, image.depth.clip(max=2048), image.labels))
-        panoramas.append([part.pin_memory() if _ON_GPU else part for part in parts])
+        panoramas.append([part.pin_memory() if ON_GPU else part for part in parts])
     while True:
         sets = []
         for k in torch.randint(count, (4,)).tolist():

@@ -14,8 +14,8 @@ A data set is one class. Its fields are its settings, checked by their types::
 
 `files` lists all splits without opening files.
 Problems and warnings of folders go to `self.problems`. Label images are read with the label map;
-`decode_labels`, `decode_depth`, `decode_camera` or `decode` read other formats. `decode_settings`
-adds the settings that the decoded arrays depend on, for the cache. `normalizations`, `units_per_m`,
+`decode_labels`, `decode_depth`, `decode_camera` or `decode` read other formats. `cache_settings`
+names the settings that the decoded arrays depend on. `normalizations`, `units_per_m`,
 `no_depth`, `no_distances`, `folds`, `fact_settings` and `groups` describe the data set further.
 
 The way of a file to a sample: `ImageDataModule.decode` (as stored) -> `read` (size of the run,

@@ -107,6 +107,7 @@ class DataModule(LightningDataModule, ABC):
         class_names: Name of every label; for pixel labels the first is unknown, not a class. Empty
             if the labels are distances.
         fact_settings: Settings of the class that scores on the test split depend on, see `facts`.
+        cache_settings: Attributes of the class that `read` depends on besides the files.
         test_split: Published split of the test images. With `val`, validation uses scenes of the
             training images, named ``<scene>/…``: nothing is selected on the test images.
         folds: Values of the setting ``fold``, over which published evaluations average.
@@ -127,6 +128,7 @@ class DataModule(LightningDataModule, ABC):
     labels: ClassVar[str] = PIXEL_CLASSES
     class_names: ClassVar[tuple[str, ...]] = ()
     fact_settings: ClassVar[tuple[str, ...]] = ()
+    cache_settings: ClassVar[tuple[str, ...]] = ()
     test_split: ClassVar[Literal["test", "val"]] = "test"
     folds: ClassVar[tuple[int, ...]] = ()
 
@@ -219,10 +221,6 @@ class DataModule(LightningDataModule, ABC):
             SettingError: A setting does not suit the files.
         """
 
-    def decode_settings(self) -> dict[str, Any]:
-        """Return everything that `read` depends on besides the files, for the cache."""
-        return {"data": type(self).__name__}
-
     def groups(self, files: Any) -> Sequence[str]:
         """Return the groups of an image that get rows in the results, such as its weather."""
         return ()
@@ -301,7 +299,7 @@ class DataModule(LightningDataModule, ABC):
                     self.root,
                     found=f"no {self.noun}" if self.root.is_dir() else "no such folder",
                     expected=f"{self.noun}, as docs and the docstring of the data set describe",
-                    remedy=self.get_it,
+                    remedy=f"Name its folder in data.root. {self.get_it}".rstrip(),
                 )
         self._test_images = self.problems.incomplete.get(self.test_split, "")
         if self.test_split == "val":
@@ -348,7 +346,8 @@ class DataModule(LightningDataModule, ABC):
     @cached_property
     def _cache(self) -> Cache:
         folder: Any = self.cache
-        return Cache(folder, self.decode_settings(), self.kind)
+        settings = {name: repr(getattr(self, name)) for name in self._declared("cache_settings")}
+        return Cache(folder, {"data": type(self).__name__, **settings}, self.kind)
 
     def prepare_data(self) -> None:
         """Generate the files and complete the cache."""
@@ -408,12 +407,17 @@ class DataModule(LightningDataModule, ABC):
         kind = type(self)
         is_here = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
         name = kind.__name__ if is_here else f"{kind.__module__}.{kind.__name__}"
-        settings = chain.from_iterable(vars(k).get("fact_settings", ()) for k in kind.__mro__[::-1])
         classes = getattr(self, "classes", None) or self.num_classes
         of_classes = {"classes": str(classes)} if self.class_names else {}
-        of_settings = {setting: _fact(getattr(self, setting)) for setting in settings}
+        of_settings = {
+            setting: _fact(getattr(self, setting)) for setting in self._declared("fact_settings")
+        }
         images = {"images": self._test_images} if self._test_images else {}
         return {"data": name, **of_classes, **of_settings, **images}
+
+    def _declared(self, attribute: str) -> list[str]:
+        """Return the names that the class and its bases list in an attribute."""
+        return [name for kind in type(self).__mro__[::-1] for name in vars(kind).get(attribute, ())]
 
     @property
     def label_names(self) -> tuple[str, ...]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from torch.utils.data import Dataset
 from datamodules.core.depth import STEPS_PER_M
 from datamodules.core.files import Split
 from datamodules.core.inputs import MAX_DEPTH_M, Input
-from tangent_train.geometry import equirect_elevations
+from tangent_train.geometry import equirect_elevations, random_rotation, rotation_about
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering.representations.views import Views
 from tangent_train.threads import in_threads
@@ -113,6 +114,22 @@ def sample_rng(seed: int | tuple[int, int], epoch: int, index: int) -> np.random
     """
     # A spawn key, not a longer seed: NumPy pads short seeds with zeros, so [1, 2] is [1, 2, 0].
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(epoch, index)))
+
+
+def draw_rotation(rotation: float | Literal["so3"], seed: int, index: int) -> NDArray[np.float64]:
+    """Draw the rotation R of a test image or shape, ``(3, 3)``: direction d moves to R d.
+
+    Args:
+        rotation: `so3`, or the tilt in degrees after a random rotation about the vertical.
+        seed: Seed of the run.
+        index: Index in the test split.
+    """
+    rng = sample_rng(seed, 0, index)
+    if rotation == "so3":
+        return random_rotation(rng)
+    yaw, azimuth = rng.uniform(0, 2 * math.pi, 2)
+    tilt = rotation_about((math.cos(azimuth), math.sin(azimuth), 0), math.radians(rotation))
+    return tilt @ rotation_about((0, 0, 1), yaw)
 
 
 class SplitDataset(Dataset[Any]):

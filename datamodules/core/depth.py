@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.geometry import ray_lengths
 from tangent_train.rendering.resampling import resize
+
+_Depth = TypeVar("_Depth", np.uint16, np.float32)
 
 STEPS_PER_M = 512
 """Steps of depth per meter."""
@@ -17,13 +20,13 @@ MOST_STEPS = np.iinfo(np.uint16).max
 """Largest distance in 16 bits, about 128 m."""
 
 
-def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
+def resize_depth(depth: NDArray[_Depth], shape: tuple[int, ...]) -> NDArray[_Depth]:
     """Downsample raw depth ``(H, W)``, 0 where missing, without mixing values.
 
     Like the nearest pixel, but where the center pixel is missing, the nearest valid pixel within
     the area of the target pixel is taken.
     """
-    small = resize(depth, shape, "nearest")
+    small = resize(depth, (shape[0], shape[1]), "nearest")
     holes = np.array(np.nonzero(small == 0))
     size = np.array([depth.shape]).T
     scale = size / np.array([shape]).T
@@ -41,13 +44,7 @@ def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[n
     return small
 
 
-def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Convert depth in steps of 1/512 m to meters, float32, NaN where missing."""
-    meters = steps.astype(np.float32) / np.float32(STEPS_PER_M)
-    return np.where(steps == 0, np.float32(np.nan), meters)
-
-
-def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
+def meters_to_steps(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
     """Convert depth in meters to steps of 1/512 m, rounded, at most 65535 (128 m).
 
     Depth below half a step is rounded up to one step: 0 means missing.
@@ -57,17 +54,6 @@ def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     """
     steps = np.minimum(depth_m * np.float32(STEPS_PER_M) + np.float32(0.5), MOST_STEPS)
     return np.maximum(steps.astype(np.uint16), depth_m > 0)
-
-
-def units_to_steps(stored: NDArray[np.uint16], units_per_m: int) -> NDArray[np.uint16]:
-    """Convert 16-bit depth in integer units to steps of 1/512 m, see `meters_to_steps`.
-
-    >>> units_to_steps(np.array([0, 1, 4000, 65535], np.uint16), 4000).tolist()
-    [0, 1, 512, 8388]
-    """
-    # In integers, because float32 would round some values of 16 bits to the wrong step.
-    steps = (stored.astype(np.int64) * 2 * STEPS_PER_M + units_per_m) // (2 * units_per_m)
-    return np.maximum(np.minimum(steps, MOST_STEPS).astype(np.uint16), stored > 0)
 
 
 def distance_from_z_depth(

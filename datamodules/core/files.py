@@ -146,17 +146,6 @@ class Problems:
             if count not in allowed:
                 self.incomplete[split] = f"{count} of {' or '.join(map(str, allowed))}"
 
-    def note_strays(self, labels: Iterable[Path], images: Iterable[ImageFiles]) -> None:
-        """Warn of label images that belong to none of the images."""
-        strays = set(labels) - {image.labels for image in images}
-        self.note_absent("label images", map(str, strays))
-
-    def note_absent(self, source: str, names: Iterable[str]) -> None:
-        """Warn of names in a list or folder that belong to no image."""
-        shown = sorted(repr(name)[1:-1] for name in names)
-        if shown:
-            self.warnings.append(f"{source}: {len(shown)} without an image, e.g. {shown[0]}")
-
     def listed(self) -> list[Problem]:
         """Problems without duplicates, sorted by file."""
         once = {(problem.file, problem.finding): problem for problem in self._noted}

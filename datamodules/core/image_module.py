@@ -15,13 +15,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from datamodules.core.data_module import DataModule, data_set
-from datamodules.core.dataset import Image, ImageDataset, Labels, sample_rng
+from datamodules.core.dataset import Image, ImageDataset, Labels, draw_rotation
 from datamodules.core.depth import (
     MOST_STEPS,
     STEPS_PER_M,
     distance_from_z_depth,
+    meters_to_steps,
     resize_depth,
-    units_to_steps,
 )
 from datamodules.core.files import ImageFiles, Split
 from datamodules.core.inputs import (
@@ -35,7 +35,7 @@ from datamodules.core.inputs import (
 )
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES, UNKNOWN_NAME, LabelMap
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.geometry import PanoramaPose, random_rotation, rotation_about, shift_range
+from tangent_train.geometry import PanoramaPose, shift_range
 from tangent_train.geometry.sphere import check_area
 from tangent_train.io.gpano import (
     Fill,
@@ -46,7 +46,7 @@ from tangent_train.io.gpano import (
     read_up,
 )
 from tangent_train.io.masks import Masks
-from tangent_train.io.pixel_files import read_image_size, read_pixels, read_rgb
+from tangent_train.io.pixel_files import read_depth_m, read_image_size, read_rgb
 from tangent_train.kinds import Upright
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.orientation.manhattan import MOST_ROWS
@@ -105,9 +105,10 @@ class ImageDataModule(DataModule):
     no_depth: ClassVar[str] = ""
     no_distances: ClassVar[str] = ""
     fact_settings: ClassVar[tuple[str, ...]] = ("unknown",)
+    cache_settings: ClassVar[tuple[str, ...]] = ("read_shape", "unknown", "labels", "label_map")
 
     labels: Literal["pixel_classes", "distance"] = "pixel_classes"  # type: ignore[misc]
-    inputs: Sequence[Input] = ("rgb", "depth")
+    inputs: Sequence[Input] = ("rgb",)
     color_jitter: Annotated[float, Field(ge=0, le=1)] = 0.0
     classes: str | int | None = None
     unknown: Unknown = "labels"
@@ -172,12 +173,9 @@ class ImageDataModule(DataModule):
         return labels
 
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Return depth in steps of 1/512 m, 0 where missing."""
+        """Return depth in steps of 1/512 m, 0 where missing; see `read_depth_m`."""
         path: Any = files.depth
-        stored = read_pixels(path, indices=True)
-        if stored.dtype != np.uint16 or stored.ndim > 2:
-            raise DataError(path, found=f"{stored.dtype} {stored.shape}", expected="16-bit gray")
-        return units_to_steps(stored, self.units_per_m)
+        return meters_to_steps(read_depth_m(path, self.units_per_m))
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64] | None:
         """Return ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama."""
@@ -234,11 +232,6 @@ class ImageDataModule(DataModule):
     @abstractmethod
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """Refuse an image whose rows and columns do not suit the settings."""
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        settings = {"shape": self.read_shape, "unknown": self.unknown, "labels": self.labels}
-        return {**super().decode_settings(), **settings, "label map": repr(self.label_map)}
 
     def inspect(self, files: ImageFiles, item: Image) -> tuple[NDArray[np.int64], str]:
         """See `DataModule`; of distances that are probably in other units is warned."""
@@ -460,22 +453,6 @@ def mask_black(labels: Labels, rgb: NDArray[np.uint8], unknown: Unknown) -> Labe
         return labels
     black = rgb == 0
     return np.where(black.any(-1) if unknown == "any_black" else black.all(-1), np.uint8(0), labels)
-
-
-def draw_rotation(rotation: float | Literal["so3"], seed: int, index: int) -> NDArray[np.float64]:
-    """Draw the rotation R of a test panorama, ``(3, 3)``: direction d moves to R d.
-
-    Args:
-        rotation: See `PanoramaDataModule.test_rotation`.
-        seed: Seed of the run.
-        index: Index of the panorama.
-    """
-    rng = sample_rng(seed, 0, index)
-    if rotation == "so3":
-        return random_rotation(rng)
-    yaw, azimuth = rng.uniform(0, 2 * math.pi, 2)
-    tilt = rotation_about((math.cos(azimuth), math.sin(azimuth), 0), math.radians(rotation))
-    return tilt @ rotation_about((0, 0, 1), yaw)
 
 
 def _changed(

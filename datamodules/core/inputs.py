@@ -138,11 +138,9 @@ def normalize(
 
     """
     rgb, *others = rendered
-    *batch, height, width, _ = rgb.shape
-    images = rgb.new_empty((*batch, 3 + len(others), height, width), dtype=torch.float32)
-    images[..., :3, :, :] = rgb.movedim(-1, -3)
-    for channel, other in enumerate(others, start=3):
-        images[..., channel, :, :] = other
+    images = rgb.movedim(-1, -3).to(torch.float32, memory_format=torch.contiguous_format)
+    if others:
+        images = torch.cat([images, *(other.unsqueeze(-3) for other in others)], dim=-3)
     units = [255] * 3 + [STEPS_PER_M] * ("depth" in inputs)
     normalize_channels(images[..., : len(units), :, :], units, normalization)
     return images

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.data_module import print_on_rank_zero
+from datamodules.core.files import ImageFiles
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.gpano import PanoramaArea, check_resolution, read_area
 from tangent_train.io.image_files import image_paths, short_names
 from tangent_train.io.pixel_files import read_rgb
+from tangent_train.rendering.resampling import resize
 
 
 class PairedPanorama(NamedTuple):
@@ -81,7 +83,7 @@ class PanoramaPairs(ABC):
 
     Attributes:
         published: The paper's scores by name of the pair, for the paper's pairs.
-        pairs: Unique name of each pair, and the files of its two panoramas.
+        pairs: Unique name of each pair, and the files of its two panoramas, with their image `rgb`.
     """
 
     published: Mapping[str, PublishedPair] = MappingProxyType({})
@@ -89,10 +91,6 @@ class PanoramaPairs(ABC):
 
     def make_files(self) -> None:  # noqa: B027, most have all their files
         """Generate missing files; called before anything else."""
-
-    @abstractmethod
-    def image(self, files: Any) -> Path:
-        """Return the image file of a panorama of `pairs`."""
 
     @abstractmethod
     def panorama(self, files: Any) -> PairedPanorama:
@@ -110,8 +108,7 @@ class PanoramaPairs(ABC):
     @property
     def files(self) -> list[Path]:
         """Image files of all panoramas, without duplicates."""
-        sides = (side for _, *both in self.pairs for side in both)
-        return list(dict.fromkeys(map(self.image, sides)))
+        return list(dict.fromkeys(side.rgb for _, *both in self.pairs for side in both))
 
     def read(self, index: int) -> PanoramaPair:
         """Read a pair.
@@ -124,16 +121,17 @@ class PanoramaPairs(ABC):
         return PanoramaPair(name, split, self.panorama(left), self.panorama(right))
 
 
-def paired_shape(path: Path, rgb: NDArray[np.uint8], erp_height: int | None) -> tuple[int, int]:
-    """Return the rows and columns to read a panorama at: `erp_height`, or those of its image.
+def read_whole(path: Path, erp_height: int | None) -> NDArray[np.uint8]:
+    """Read the image of a whole panorama, downsampled to `erp_height` rows unless it is None.
 
     Raises:
         DataError: The image is not a panorama.
         SettingError: The image has fewer rows than `erp_height`.
     """
-    size = (rgb.shape[0], rgb.shape[1])
+    rgb = read_rgb(path)
+    size = rgb.shape[0], rgb.shape[1]
     check_resolution(path, size, PanoramaArea.on_canvas(None, erp_height or 1), None)
-    return size if erp_height is None else (erp_height, 2 * erp_height)
+    return rgb if erp_height is None else resize(rgb, (erp_height, 2 * erp_height), "bilinear")
 
 
 class ImagePairs(PanoramaPairs):
@@ -163,19 +161,13 @@ class ImagePairs(PanoramaPairs):
             expected = "left=<panorama> right=<panorama>, or input=<folder of panoramas>"
             found = f"{' '.join(map(str, given))}: {len(paths)} panoramas"
             raise SettingError("input", found=found, expected=expected)
-        self._paths, self._names = paths, short_names(paths)
-        indices = range(len(paths))
-        chosen = pairwise(indices) if pairing == "consecutive" else combinations(indices, 2)
-        self.pairs = [(f"{self._names[k]} – {self._names[j]}", k, j) for k, j in chosen]
+        images = map(ImageFiles, short_names(paths), paths)
+        chosen = pairwise(images) if pairing == "consecutive" else combinations(images, 2)
+        self.pairs = [(f"{one.name} – {other.name}", one, other) for one, other in chosen]
 
-    def image(self, files: int) -> Path:
-        """See `PanoramaPairs`."""
-        return self._paths[files]
-
-    def panorama(self, files: int) -> PairedPanorama:
+    def panorama(self, files: ImageFiles) -> PairedPanorama:
         """See `PanoramaPairs`; a partial panorama repeats its edges elsewhere."""
-        path = self._paths[files]
-        rgb = read_rgb(path)
-        area = read_area(path, (rgb.shape[0], rgb.shape[1]))
+        rgb = read_rgb(files.rgb)
+        area = read_area(files.rgb, (rgb.shape[0], rgb.shape[1]))
         whole = area.filled(area.place(rgb), "edge")
-        return PairedPanorama(self._names[files], whole, path, valid=area.valid)
+        return PairedPanorama(files.name, whole, files.rgb, valid=area.valid)

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from datamodules.core.data_module import data_set
 from datamodules.core.depth import meters_to_steps
 from datamodules.core.files import ImageFiles, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap, read_label_map
 from datamodules.folder.cameras import FolderCameras, read_folder_cameras
 from datamodules.folder.splits import FolderSplits
@@ -51,7 +50,8 @@ class LabeledFolder(ImageDataModule):
         DataError: ``classes.json`` is missing or cannot be used.
     """
 
-    inputs: Sequence[Input] = ("rgb",)
+    cache_settings: ClassVar[tuple[str, ...]] = ("depth_units_per_m", "depth_channel")
+
     test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
     split_seed: NonNegativeInt = 0
     depth_units_per_m: PositiveFloat = 1000
@@ -103,8 +103,10 @@ class LabeledFolder(ImageDataModule):
         """Warn of files that training passes over: labels of no image, and no images."""
         names = {files.name for files in images}
         folder = self.root / ("depth" if self.has_distances else "labels")
-        paths = list(image_files.walk_files(folder))
-        self.problems.note_absent(str(folder), {_name(folder, path) for path in paths} - names)
+        strays = sorted({_name(folder, path) for path in image_files.walk_files(folder)} - names)
+        if strays:
+            found = f"{len(strays)} without an image, e.g. {repr(strays[0])[1:-1]}"
+            self.problems.warnings.append(f"{folder}: {found}")
         folder = self.root / "images"
         others = {*image_files.walk_files(folder)} - {files.rgb for files in images}
         suffixes = {path.suffix.lower() for path in others}
@@ -115,11 +117,6 @@ class LabeledFolder(ImageDataModule):
         """See `ImageDataModule`."""
         path: Any = files.depth
         return meters_to_steps(read_depth_m(path, self.depth_units_per_m, self.depth_channel))
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        depth = {"units": self.depth_units_per_m, "channel": self.depth_channel}
-        return {**super().decode_settings(), **depth}
 
 
 @data_set
@@ -136,6 +133,8 @@ class FolderPhotos(LabeledFolder, PhotoDataModule):
             None to read it from EXIF data.
     """
 
+    cache_settings = ("cameras",)
+
     fov: Annotated[float, Field(gt=0, lt=180)] | None = None
 
     @cached_property
@@ -146,10 +145,6 @@ class FolderPhotos(LabeledFolder, PhotoDataModule):
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """Return the camera by ``cameras.json``, the field of view or the EXIF data."""
         return self.cameras.matrix(files)
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        return {**super().decode_settings(), "cameras": repr(self.cameras)}
 
 
 def _name(folder: Path, path: Path) -> str:

@@ -17,7 +17,6 @@ The class is the folder, or the name of the file without its number. Other files
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -29,12 +28,11 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from datamodules.core.data_module import DataModule, data_set
-from datamodules.core.dataset import SplitDataset, sample_rng
+from datamodules.core.dataset import SplitDataset, draw_rotation
 from datamodules.core.files import SPLITS, Split, draw_groups
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.label_map import IMAGE_CLASS
 from datamodules.modelnet40.meshes import CHANNELS, mesh_spheres, read_mesh
-from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.io.image_files import glob_files
 from tangent_train.threads import in_processes
 
@@ -62,10 +60,6 @@ coarse around 1, and OpenCV does not sample it.
 """
 
 _PER_PROCESS = 40
-_GET_IT = (
-    "Get ModelNet40.zip from https://modelnet.cs.princeton.edu and name the unpacked folder in "
-    "data.root. Or choose data=synthshapes, which needs no download."
-)
 
 
 class ShapeFile(NamedTuple):
@@ -153,10 +147,8 @@ class ShapeDataset(SplitDataset):
 
     def shape_rotation(self, index: int) -> NDArray[np.float64]:
         """Return the rotation R of a test shape, ``(3, 3)``: point x moves to R x."""
-        rng = sample_rng(self.data.seed, 0, index)
-        if self.data.test_rotation == "so3":
-            return random_rotation(rng)
-        return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
+        is_yaw = self.data.test_rotation == "yaw"
+        return draw_rotation(0 if is_yaw else "so3", self.data.seed, index)
 
 
 @data_set
@@ -182,9 +174,10 @@ class ModelNet40(DataModule):
     kind = Spheres
     samples = ShapeDataset
     default_level = 5
-    get_it = _GET_IT
+    get_it = "Get it from https://modelnet.cs.princeton.edu, or choose data=synthshapes."
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
+    cache_settings = ("erp_height",)
 
     batch_size: PositiveInt = 16
     test_rotation: Literal["yaw", "so3"] | None = None
@@ -220,10 +213,6 @@ class ModelNet40(DataModule):
         shape = self.erp_height, 2 * self.erp_height
         values = mesh_spheres(read_mesh(files.path), shape)
         return Spheres(np.rint(values * STEPS).astype(np.uint16))
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        return {**super().decode_settings(), "height": self.erp_height}
 
     def in_parallel(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Generator[Any]:
         """See `DataModule`: in processes, because reading meshes holds the GIL."""

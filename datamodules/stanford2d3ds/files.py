@@ -16,13 +16,9 @@ Angles in pose files are XYZ Euler angles of Blender's camera, which faces −z 
 
 from __future__ import annotations
 
-import math
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
-
-from tangent_train.geometry import rotation_about
 
 Area = Literal["1", "2", "3", "4", "5a", "5b", "6"]
 AREAS: tuple[Area, ...] = get_args(Area)
@@ -54,18 +50,3 @@ BLENDER = np.diag([1.0, -1.0, -1.0])
 
 CAMERA_FROM_SPHERE = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
 """A panorama's axes (x to the middle, y right, z up) to a camera's (x right, y down, z forward)."""
-
-
-def euler_rotation(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ``Rz(c) Ry(b) Rx(a)`` of XYZ Euler angles (a, b, c)."""
-    x, y, z = map(rotation_about, np.eye(3), angles_rad)
-    return z @ y @ x
-
-
-def euler_angles(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return XYZ Euler angles in radians; inverse of `euler_rotation` with b in [−π/2, π/2]."""
-    b = math.asin(np.clip(-rotation[2, 0], -1, 1))
-    if abs(rotation[2, 0]) > 1 - 1e-12:  # a and c rotate about the same axis: give all to c
-        return np.array([0, b, math.atan2(-rotation[0, 1], rotation[1, 1])])
-    a = math.atan2(rotation[2, 1], rotation[2, 2])
-    return np.array([a, b, math.atan2(rotation[1, 0], rotation[0, 0])])

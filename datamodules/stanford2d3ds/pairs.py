@@ -17,32 +17,31 @@ from dataclasses import field
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 from pydantic import PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.depth import resize_depth, steps_to_meters
+from datamodules.core.depth import STEPS_PER_M, resize_depth
 from datamodules.core.files import ImageFiles, Problems
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
     PanoramaPairs,
     PublishedPair,
-    paired_shape,
+    read_whole,
 )
 from datamodules.stanford2d3ds.files import AREAS
 from datamodules.stanford2d3ds.panoramas import (
     GET_IT,
     list_pictures,
-    read_depth,
     read_panorama_pose,
     room_of,
     sibling,
 )
 from datamodules.tables import read_table
 from tangent_train.errors import DataError
-from tangent_train.io.pixel_files import read_rgb
-from tangent_train.rendering.resampling import resize
+from tangent_train.io.pixel_files import read_depth_m
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
 
@@ -119,18 +118,14 @@ class StanfordPairs(PanoramaPairs):
             raise DataError(self.root, found=none, expected=expected, remedy=GET_IT)
         return chosen
 
-    def image(self, files: ImageFiles) -> Path:
-        """See `PanoramaPairs`."""
-        return files.rgb
-
     def panorama(self, files: ImageFiles) -> PairedPanorama:
         """See `PanoramaPairs`."""
-        rgb = read_rgb(files.rgb)
-        shape = paired_shape(files.rgb, rgb, self.erp_height)
-        distance_m = steps_to_meters(resize_depth(read_depth(files.depth), shape))
+        path: Any = files.depth
+        rgb = read_whole(files.rgb, self.erp_height)
+        depth_m = resize_depth(read_depth_m(path, STEPS_PER_M), rgb.shape[:2])
+        depth_m[depth_m == 0] = np.nan
         pose = read_panorama_pose(sibling(files.rgb, "pose.json"))
-        small = resize(rgb, shape, "bilinear")
-        return PairedPanorama(files.name, small, files.rgb, distance_m, pose)
+        return PairedPanorama(files.name, rgb, files.rgb, depth_m, pose)
 
 
 def _camera(files: ImageFiles) -> str:

@@ -37,23 +37,20 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import Rotation
 
 from datamodules.core.data_module import data_set
-from datamodules.core.depth import STEPS_PER_M, meters_to_steps
 from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
+from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.stanford2d3ds import files as stanford
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.image_files import glob_files
-from tangent_train.io.pixel_files import read_depth_m
 
-GET_IT = (
-    "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
-    "the folder with area_1 … area_6, or train on data=synthrooms, which needs no download."
-)
+GET_IT = "Get Stanford2D3DS from http://buildingparser.stanford.edu, or choose data=synthrooms."
 """Remedy if the data set is missing."""
 
 _NAME = re.compile(
@@ -159,8 +156,10 @@ class StanfordImages(ImageDataModule):
     group: ClassVar[Literal["pano", "data"]]
     get_it = GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("areas",)
+    cache_settings: ClassVar[tuple[str, ...]] = ("_label_table",)
     folds: ClassVar[tuple[int, ...]] = tuple(stanford.FOLDS)
 
+    inputs: Sequence[Input] = ("rgb", "depth")
     fold: Literal[1, 2, 3] = 1
     areas: Sequence[stanford.Area] = stanford.AREAS
     label_table: Path | None = None
@@ -186,21 +185,19 @@ class StanfordImages(ImageDataModule):
         return {"train": train, "val": val, "test": test}
 
     @cached_property
-    def _label_table(self) -> LabelMap:
-        """Label of the color of every instance."""
-        label_map: Any = self.label_map
+    def _label_table(self) -> LabelMap | None:
+        """Label of the color of every instance; None if the labels are distances."""
+        if self.label_map is None:
+            return None
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         path = self.label_table or next(filter(Path.is_file, places), places[0])
-        return read_label_table(path).regrouped(label_map.names)
+        return read_label_table(path).regrouped(self.label_map.names)
 
     def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """See `ImageDataModule`: by the class table."""
-        path: Any = files.labels
-        return self._label_table.read_labels(path)
-
-    def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """See `ImageDataModule`."""
-        return read_depth(files.depth)
+        table: Any = self._label_table
+        labels: NDArray[np.uint8] = table.read_labels(files.labels)
+        return labels
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
         """See `ImageDataModule`: by the pose file, if there is one."""
@@ -208,11 +205,6 @@ class StanfordImages(ImageDataModule):
         if not path.is_file():
             return None
         return read_panorama_pose(path) if files.camera is None else read_photo_pose(path)
-
-    def decode_settings(self) -> dict[str, Any]:
-        """See `DataModule`."""
-        table = "" if self.has_distances else str(self._label_table.labels)
-        return {**super().decode_settings(), "class table": table}
 
 
 @data_set
@@ -235,15 +227,6 @@ class Stanford2D3DSPerspective(StanfordImages, PhotoDataModule):
         """See `ImageDataModule`: by the pose file."""
         matrix: NDArray[np.float64] = np.array(_read_pose_file(files.camera).camera_k_matrix)
         return _CENTERS_FROM_CORNERS @ matrix
-
-
-def read_depth(path: Any) -> NDArray[np.uint16]:
-    """Read depth in steps of 1/512 m, 0 where missing.
-
-    Raises:
-        DataError: The file is broken, or holds no depth.
-    """
-    return meters_to_steps(read_depth_m(path, STEPS_PER_M))
 
 
 class _PoseRecord(BaseModel):
@@ -275,7 +258,7 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
     angles = np.array(record.camera_original_rotation)
     if np.abs(angles).max() > 2 * math.pi:
         angles = np.radians(angles)
-    original = stanford.euler_rotation(angles)
+    original = Rotation.from_euler("xyz", angles).as_matrix()
     rotation = np.array(record.camera_rt_matrix)[:3, :3]
     world_from_panorama = original @ rotation @ original @ stanford.CAMERA_FROM_SPHERE
     return PanoramaPose(world_from_panorama, record.camera_location)

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.depth import units_to_steps
+from datamodules.core.depth import meters_to_steps
 from datamodules.core.files import ImageFiles, Problems, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.inputs import RGBD_NORMALIZATION, Input, Normalization
+from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.label_map import LabelMap
 from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas
@@ -73,11 +73,9 @@ class SynthiaSequences(ImageDataModule):
 
     label_maps: ClassVar[Mapping[str, LabelMap]] = {"13": _LABELS}
     normalizations = _NORMALIZATIONS
-    units_per_m = 100
     get_it = reader.GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
 
-    inputs: Sequence[Input] = ("rgb",)
     train_sequences: Annotated[Sequences, Field(min_length=1)] = ("01", "02", "05", "06")
     test_sequences: Annotated[Sequences, Field(min_length=1)] = ("04",)
     frames: PositiveInt = reader.FRAMES
@@ -118,7 +116,7 @@ class SynthiaSequences(ImageDataModule):
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`: centimeters in the first channel."""
         path: Any = files.depth
-        return units_to_steps(reader.read_first_channel(path), self.units_per_m)
+        return meters_to_steps(reader.read_first_channel(path) / np.float32(100))
 
 
 @data_set

@@ -33,10 +33,7 @@ from tangent_train.io.pixel_files import read_pixels
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
 """Front, right, back, left: each rotated by 90° to the right of the previous one."""
 
-GET_IT = (
-    "Get SYNTHIA-SEQS-01, -02, -04, -05 and -06 SUMMER from http://synthia-dataset.net and point "
-    "data.root at the folder that holds them."
-)
+GET_IT = "Get SYNTHIA-SEQS-01, -02, -04, -05 and -06 SUMMER from http://synthia-dataset.net."
 """Remedy if the data set is missing."""
 
 FRAMES = 500

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, NonNegativeInt, PositiveInt
 from pydantic.dataclasses import dataclass
+from scipy.spatial.transform import Rotation
 
 from datamodules.core.data_module import data_set
 from datamodules.stanford2d3ds import files as stanford
@@ -248,17 +249,19 @@ def pose_record(
     fov_rad = view.fov_rad or math.pi / 2
     focal, center = view.size / (2 * math.tan(fov_rad / 2)), view.size / 2
     rotation, original = view.world_from_camera, panorama.world_from_camera
+    turns = (original @ stanford.BLENDER, rotation @ original.T, rotation @ stanford.BLENDER)
+    first, between, last = Rotation.from_matrix(turns).as_euler("xyz").tolist()
     room_to_camera = np.hstack([rotation.T, -(rotation.T @ view.location)[:, None]])
     return {
         "camera_k_matrix": [[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]],
         "field_of_view_rads": fov_rad,
-        "camera_original_rotation": stanford.euler_angles(original @ stanford.BLENDER).tolist(),
-        "rotation_from_original_to_point": stanford.euler_angles(rotation @ original.T).tolist(),
+        "camera_original_rotation": first,
+        "rotation_from_original_to_point": between,
         "point_uuid": camera,
         "camera_location": view.location.tolist(),
         "frame_num": frame,
         "camera_rt_matrix": room_to_camera.tolist(),
-        "final_camera_rotation": stanford.euler_angles(rotation @ stanford.BLENDER).tolist(),
+        "final_camera_rotation": last,
         "camera_uuid": camera,
         "room": f"{room.name}_{room.area[0]}",
     }

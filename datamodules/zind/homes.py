@@ -23,10 +23,7 @@ from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose, rotation_about
 from tangent_train.io.image_files import glob_files
 
-GET_IT = (
-    "Get the sample tour from https://github.com/zillow/zind or request the whole set there, and "
-    "point data.root at the folder that holds the homes (sample_tour)."
-)
+GET_IT = "Get the sample tour from https://github.com/zillow/zind, or request the whole set there."
 _FROM_SPHERE = np.array([[0, -1.0, 0], [1.0, 0, 0], [0, 0, 1.0]])
 """Axes of a panorama (x to the middle, y right, z up) to ZInD's (x left, y to the middle, z up)."""
 
@@ -93,7 +90,7 @@ class HomePanorama(NamedTuple):
         return self.file.parent.name
 
     @property
-    def image(self) -> Path:
+    def rgb(self) -> Path:
         """Path of the picture."""
         return self.file.parent / self.record.image_path
 

@@ -49,15 +49,12 @@ from pydantic import Field, NonNegativeInt, PositiveInt
 from datamodules.core.data_module import data_set
 from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
+from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, read_whole
 from datamodules.zind.homes import GET_IT, HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
-from tangent_train.io.pixel_files import read_rgb
-from tangent_train.rendering.resampling import resize
 
 
 @data_set
@@ -78,9 +75,8 @@ class Zind(PanoramaDataModule):
     label_maps = {"5": LabelMap.of(CLASSES, [0])}  # noqa: RUF012, never changed
     no_depth = "ZInD has no depth images"
     get_it = GET_IT
-    fact_settings = ("doors",)
+    fact_settings = cache_settings = ("doors",)
 
-    inputs: Sequence[Input] = ("rgb",)
     doors: Literal["class", "ignore"] = "class"
     test_fraction: Annotated[float, Field(gt=0, le=1)] = 0.2
     split_seed: NonNegativeInt = 0
@@ -93,7 +89,7 @@ class Zind(PanoramaDataModule):
         splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
         for one in panoramas:
             split = of_group[one.home] if one.home in of_group else of_group[one.room]
-            splits[split].append(ImageFiles(one.name, one.image, one.file))
+            splits[split].append(ImageFiles(one.name, one.rgb, one.file))
         return splits
 
     @cached_property
@@ -128,10 +124,6 @@ class Zind(PanoramaDataModule):
         if self.doors == "ignore":
             labels[labels == DOOR] = 0
         return labels
-
-    def decode_settings(self) -> dict[str, object]:
-        """See `DataModule`."""
-        return {**super().decode_settings(), "doors": self.doors}
 
 
 @data_set
@@ -178,15 +170,9 @@ class ZindPairs(PanoramaPairs):
             )
         return pairs
 
-    def image(self, files: HomePanorama) -> Path:
-        """See `PanoramaPairs`."""
-        return files.image
-
     def panorama(self, files: HomePanorama) -> PairedPanorama:
         """See `PanoramaPairs`."""
-        rgb = read_rgb(files.image)
-        shape = paired_shape(files.image, rgb, self.erp_height)
+        rgb = read_whole(files.rgb, self.erp_height)
         pose, unit_m = files.pose()
-        distance_m = (files.layout().distances(shape) * unit_m).astype(np.float32)
-        small = resize(rgb, shape, "bilinear")
-        return PairedPanorama(files.name, small, files.image, distance_m, pose)
+        distance_m = (files.layout().distances(rgb.shape[:2]) * unit_m).astype(np.float32)
+        return PairedPanorama(files.name, rgb, files.rgb, distance_m, pose)

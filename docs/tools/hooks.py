@@ -1,4 +1,4 @@
-"""Hooks of MkDocs: notebooks, pages of the root folder, links to files outside the site."""
+"""Hooks of MkDocs: notebooks, files from outside docs/, links to files outside the site."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parents[2]
-ROOT_PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
-"""Files of the root folder that are pages of the site."""
+OUTER_FILES = {
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "tangent_train/results/published.csv": "reference/published.csv",
+}
+"""Files outside docs/ by their place in the site."""
 
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?!\w+:|#)([^()\s#]+)(#[^()\s]*)?\)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages of the root folder; replace notebooks by pages."""
-    for name, page in ROOT_PAGES.items():
+    """Add the files from outside docs/; replace notebooks by pages."""
+    for name, page in OUTER_FILES.items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / name)))
     for file in list(files):
         if file.src_uri.endswith(".ipynb"):
@@ -32,15 +36,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Point links to the page of a notebook or root file; keep only the text of other links out."""
-    root_file = next((name for name, uri in ROOT_PAGES.items() if uri == page.file.src_uri), None)
-    source = root_file or f"docs/{page.file.src_uri}"
+    """Point links to the page of a notebook or file; keep only the text of other links out."""
+    outer_file = next((name for name, uri in OUTER_FILES.items() if uri == page.file.src_uri), None)
+    source = outer_file or f"docs/{page.file.src_uri}"
 
     def replace(found: re.Match[str]) -> str:
         image, text, target, anchor = found[1], found[2], found[3], found[4] or ""
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
-        if path in ROOT_PAGES:
-            uri = ROOT_PAGES[path]
+        if path in OUTER_FILES:
+            uri = OUTER_FILES[path]
         elif path.startswith("docs/"):
             uri = _page_of(path.removeprefix("docs/"))
         elif (ROOT / path).exists():

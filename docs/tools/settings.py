@@ -6,8 +6,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from tangent_train.config.help import (
     Setting,
@@ -18,50 +21,73 @@ from tangent_train.config.help import (
 )
 from tangent_train.config.settings import SETTINGS, RunSettings
 from tangent_train.files import config_folder
-from tangent_train.results.published import facts, protocols, published_lines
+from tangent_train.results.published import facts, protocols
 
 CONFIGS = config_folder()
 REFERENCE = Path(__file__).parents[1] / "reference"
-GROUPS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer",
-          "logger", "callbacks", "recipe", "debug", "sweep", "launcher")  # fmt: skip
+COMMANDS = {
+    "train": ("train", "evaluate", "transfer", "prepare", "check"),
+    "predict": ("predict",),
+    "import": ("import", "export"),
+    "render": ("render",),
+    "keypoints": ("keypoints",),
+}
+"""Commands by the page of their settings; the commands of a page share settings."""
+
+GROUPS = {
+    "data": ("data",),
+    "networks": ("representation", "network"),
+    "runs": ("task", "optimizer", "scheduler", "trainer", "logger", "callbacks", "recipe",
+             "debug", "sweep", "launcher"),
+}  # fmt: skip
+"""Groups by the page of their settings."""
+
+_PAGE_OF = {group: page for page, groups in GROUPS.items() for group in groups}
+_EXPERIMENTS = ("| experiment | content |", "| --- | --- |")
 _MARK = "<!-- generated -->\n"
 
 
 def pages() -> dict[Path, str]:
     """Return the generated pages by their paths."""
-    settings = ["## Commands\n", *map(_command, SETTINGS), "## Groups\n"]
-    for group in GROUPS:
-        settings += [f"### {group}\n", *map(_option, sorted((CONFIGS / group).glob("*.yaml")))]
-    experiments = map(_experiment, sorted((CONFIGS / "experiment").rglob("*.yaml")))
-    generated = {
-        "settings.md": settings,
-        "experiments.md": experiments,
-        "protocols.md": map(_protocol, protocols()),
+    generated: dict[str, Iterable[str]] = {
+        f"settings/{page}.md": (f"# Settings of tangent-{page}\n", *map(_command, commands))
+        for page, commands in COMMANDS.items()
     }
-    return {REFERENCE / name: _below_head(name, parts) for name, parts in generated.items()}
+    for page, groups in GROUPS.items():
+        title = f"# Settings of {page}\n"
+        generated[f"settings/{page}.md"] = (title, *map(_group, groups))
+    experiments = map(_experiment, sorted((CONFIGS / "experiment").rglob("*.yaml")))
+    generated["experiments.md"] = (_below_head("experiments.md"), *_EXPERIMENTS, *experiments, "")
+    data_sets = dict.fromkeys(facts(name)["data"] for name in protocols())
+    generated["protocols.md"] = (_below_head("protocols.md"), *map(_data_set, data_sets))
+    return {REFERENCE / name: "\n".join(parts) for name, parts in generated.items()}
 
 
-def _below_head(name: str, parts: Iterable[str]) -> str:
-    """Return a page with new text below its mark; the text above is written by hand."""
-    head = (REFERENCE / name).read_text("utf-8").partition(_MARK)[0]
-    return head + _MARK + "\n" + "\n".join(parts)
+def _below_head(name: str) -> str:
+    """Return the text of a page above its mark, which is written by hand, and the mark."""
+    return (REFERENCE / name).read_text("utf-8").partition(_MARK)[0] + _MARK
 
 
-def _protocol(name: str) -> str:
-    entry = protocols()[name]
-    run = f"\n\n`experiment={entry['experiment']}`" if "experiment" in entry else ""
-    ordered = sorted(facts(name).items(), key=lambda fact: fact[0] not in ("data", "classes"))
-    listed = [f"| `{fact}` | {value} |" for fact, value in ordered]
-    lines = [line for line in published_lines() if line["protocol"] == name and line["mean"]]
-    columns = ("method", "stage", "trained_on", "level", "inputs", "fold", "score", "mean")
-    shown = [column for column in columns if any(line[column] for line in lines)]
-    rows = [
-        f"| {' | '.join(line[c] or '–' for c in shown)} | <{line['source']}> |" for line in lines
-    ]
-    head = [*(column.replace("_", " ") for column in shown), "source"]
-    table = [f"| {' | '.join(head)} |", f"| {' | '.join('---' for _ in head)} |", *rows]
-    text = f"## {name}\n\n{entry['about']}{run}\n\n| fact | value |\n| --- | --- |\n"
-    return text + "\n".join([*listed, "", *(table if lines else ["No score is published."]), ""])
+def _data_set(data: str) -> str:
+    """Return the section of a data set: the facts of its protocols, and notes on them."""
+    found = {name: facts(name) for name in protocols() if facts(name)["data"] == data}
+    counts = Counter(fact for of in found.values() for fact in of.items())
+    usual = dict(fact for fact, count in counts.items() if count > max(1, len(found) / 2))
+    rows, notes = [], []
+    for name, of in found.items():
+        entry = protocols()[name]
+        run = f"`{entry['experiment']}`" if "experiment" in entry else "–"
+        every = dict.fromkeys(usual, "–") | of  # depth has no classes
+        own = _facts({fact: value for fact, value in every.items() if usual.get(fact) != value})
+        rows.append(f"| `{name}` | {own} | {run} |")
+        notes += [f"* `{name}`: {entry['about']}"] if "about" in entry else []
+    start = f"Unless a row states other values: {_facts(usual)}.\n\n" if usual else ""
+    table = ["| protocol | facts | experiment |", "| --- | --- | --- |", *rows, ""]
+    return f"## {data}\n\n{start}" + "\n".join([*table, *notes, ""])
+
+
+def _facts(values: Mapping[str, str]) -> str:
+    return "; ".join(f"`{name}` {value}" for name, value in values.items() if name != "data")
 
 
 def _command(name: str) -> str:
@@ -70,22 +96,51 @@ def _command(name: str) -> str:
     if name != "train" and issubclass(SETTINGS[name], RunSettings):
         of_training = command_settings("train")
         settings = [setting for setting in settings if setting not in of_training]
-        note = "It has the settings of [tangent-train](#tangent-train), except for `init_from` and "
-        note += f"`resume`{', with:' if settings else '.'}\n\n"
-    return f"### tangent-{name}\n\n{_text(description(file)[0])}\n\n{note}{_table(settings)}"
+        note = "It has the settings of [tangent-train](train.md#tangent-train), "
+        note += f"except for `init_from` and `resume`{', with:' if settings else '.'}\n\n"
+    return f"## tangent-{name}\n\n{_text(description(file)[0])}\n\n{note}{_table(settings)}"
 
 
-def _option(file: Path) -> str:
-    settings = [s for s in read_settings(file) if not s.name.endswith(("_target_", "_partial_"))]
+def _group(name: str) -> str:
+    """Return the options of a group; settings of several options are described once, first."""
+    files = sorted((CONFIGS / name).glob("*.yaml"))
+    listed = {file: [s for s in read_settings(file) if _is_shown(s)] for file in files}
+    values: dict[tuple[str, str], Counter[str]] = {}
+    for setting in chain.from_iterable(listed.values()):
+        values.setdefault((setting.name, setting.comment), Counter())[setting.value] += 1
+    common = {
+        key: Setting(key[0], counts.most_common(1)[0][0], key[1])
+        for key, counts in sorted(values.items())
+        if counts.total() > 1
+    }
+    shared = f"Settings of several options:\n\n{_table(common.values())}" if common else ""
+    options = [_option(file, settings, common) for file, settings in listed.items()]
+    return "\n".join([f"## {name}\n", shared, *options])
+
+
+def _option(file: Path, settings: list[Setting], common: Mapping[Any, Setting]) -> str:
     names = [f"`{file.parent.name}={name}`" for group, _, name in bases(file) if not group]
-    note = f"Based on {' and '.join(names)}{', with:' if settings else '.'}\n\n" if names else ""
-    return f"#### {file.parent.name}={file.stem}\n\n{_prose(file)}\n\n{note}{_table(settings)}"
+    notes = [f"Based on {' and '.join(names)}."] if names else []
+    used = [(setting, common.get((setting.name, setting.comment))) for setting in settings]
+    also = [
+        f"`{setting.name}`" if setting == usual else _value(f"{setting.name}={setting.value}")
+        for setting, usual in used
+        if usual
+    ]
+    notes += [f"Settings described above: {', '.join(also)}."] if also else []
+    table = _table(setting for setting, usual in used if not usual)
+    parts = [f"### {file.parent.name}={file.stem}", _prose(file), " ".join(notes), table.rstrip()]
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
 def _experiment(file: Path) -> str:
     name = file.relative_to(CONFIGS / "experiment").with_suffix("").as_posix()
-    content = re.sub(r"\A(#.*\n)+", "", file.read_text("utf-8")).strip()
-    return f"## {name}\n\n{_prose(file)}\n\n```yaml\n{content}\n```\n"
+    about = re.split(r"(?<! al)\.(?: |$)", " ".join(description(file)))[0]
+    return f"| `{name}` | {_text(about, '../')} |"
+
+
+def _is_shown(setting: Setting) -> bool:
+    return bool(setting.value) and not setting.name.endswith(("_target_", "_partial_"))
 
 
 def _table(settings: Iterable[Setting]) -> str:
@@ -100,7 +155,7 @@ def _table(settings: Iterable[Setting]) -> str:
 
 def _name(name: str) -> str:
     group = name.rpartition(".")[2]
-    return f"[`{name}`](#{group})" if group in GROUPS else f"`{name}`"
+    return f"[`{name}`]({_PAGE_OF[group]}.md#{group})" if group in _PAGE_OF else f"`{name}`"
 
 
 def _value(written: str) -> str:
@@ -114,11 +169,12 @@ def _prose(file: Path) -> str:
     )
 
 
-def _text(comment: str) -> str:
+def _text(comment: str, up: str = "../../") -> str:
     escaped = re.sub(r"([|<*\[\]])", r"\\\1", comment)
-    return re.sub(r"docs/([\w/-]+\.md)", r"[\1](../\1)", escaped)
+    return re.sub(r"docs/([\w/-]+\.md)", rf"[\1]({up}\1)", escaped)
 
 
 if __name__ == "__main__":
     for path, text in pages().items():
+        path.parent.mkdir(exist_ok=True)
         path.write_text(text, "utf-8")

@@ -6,23 +6,20 @@ import json
 from collections.abc import Collection, Mapping
 from functools import cached_property
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import pydantic
-from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
-from torch import Tensor, nn
+from torch import nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
-from models.pretrained import first_difference
+from models.pretrained import load_tensors
 from tangent_train.checkpoints.outputs import OutputNetwork
 from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
@@ -170,20 +167,6 @@ class LoadedNetwork(NetworkDescription):
         count = len(self.class_names) - 1
         return OutputNetwork(self.module, count, self.groups, tile, self.score_kind).eval()
 
-    def labels(self, best: Tensor) -> NDArray[np.unsignedinteger]:
-        """Convert indices of the best scores to labels.
-
-        Args:
-            best: Indices of scores.
-
-        Returns:
-            Labels from 1 to K; 0 where an unknown class, or no class, had the best score.
-        """
-        labels: NDArray[np.unsignedinteger] = best.cpu().numpy()
-        labels = labels + labels.dtype.type(1)
-        labels[labels >= len(self.class_names)] = 0
-        return labels
-
 
 def completed_settings(
     settings: Any, in_channels: int, num_classes: int, *, restored: bool = False
@@ -238,16 +221,11 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
     Raises:
         DataError: The file is missing, has other content, names classes that are not allowed, or
             its network cannot be built; or a package to read it is missing.
-        SettingError: A trusted package is missing.
     """
     try:
         checked_file(path)
     except OSError as error:
         raise DataError(path, found=error, expected=_EXPECTED) from error
-    for name in trust:
-        if not name or find_spec(name.partition(".")[0]) is None:
-            expected = "a package that is installed, or a module or class in it"
-            raise SettingError("trust", found=name, expected=expected)
     onnx = OnnxNetwork(path) if path.suffix.lower() == ".onnx" else None
     if onnx is None:
         described = read_description(path)
@@ -267,15 +245,7 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
     else:
         stored = load_plain(path, _EXPECTED, mmap=True)["state_dict"].items()
         tensors = {n.removeprefix(_PREFIX): t for n, t in stored if n.startswith(_PREFIX)}
-    try:
-        module.load_state_dict(tensors)
-    except (RuntimeError, TypeError, AttributeError) as error:
-        raise DataError(
-            path,
-            found=f"other tensors than those of its network ({first_difference(error)})",
-            expected=f"the tensors of {settings['_target_']}",
-            remedy="Install the version of the network's package that it was trained with.",
-        ) from error
+    load_tensors(module, tensors, path)
     return LoadedNetwork(**vars(described), module=module.eval(), trust=tuple(trust))
 
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.distortion_aware import make_distortion_aware
-from tangent_train.errors import SettingError, width_height
 from tangent_train.kinds import ScoreKind
 
 _MAP = 3
@@ -96,17 +95,7 @@ def network_for_views(network: nn.Module, distortion_aware: bool | None) -> nn.M
     Raises:
         SettingError: The convolutions cannot be sampled on the sphere.
     """
-    if not distortion_aware:
-        return network
-    tile = getattr(network, "tile", None)
-    if tile is not None:
-        raise SettingError(
-            "distortion-aware convolutions",
-            found=f"a network that takes only images of {width_height(tile)}",
-            expected="one that takes whole equirectangular images",
-            remedy="Import the network from torch, without image_size=.",
-        )
-    return make_distortion_aware(network)
+    return make_distortion_aware(network) if distortion_aware else network
 
 
 def plain_output(returned: Any) -> Tensor:

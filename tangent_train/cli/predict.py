@@ -81,11 +81,9 @@ def predict(settings: PredictSettings) -> None:
             folder.write_page(entries, list(prediction.pictures(inputs, shown)))
         folder.table(entries).print()
         if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
-            print_text(
-                "The network's output is NaN or infinite in parts of "
-                f"{counted(len(spoiled), 'images')}, which are unknown unless other views show "
-                "them: " + ", ".join(spoiled[:_NAMED]) + ", …" * (len(spoiled) > _NAMED)
-            )
+            named = ", ".join(spoiled[:_NAMED]) + ", …" * (len(spoiled) > _NAMED)
+            count = counted(len(spoiled), "images")
+            print_text(f"The network's output is NaN or infinite in parts of {count}: {named}")
         print_text(f"Results are in {settings.output}.")
     if errors:
         total = len(missing) + done
@@ -181,16 +179,16 @@ class _Prediction:
             return image
         return images.with_up(image, self._settings.max_tilt_deg, self._up_likelihood)
 
-    def predict(self, job: Job, progress: Callable[[float], object]) -> PredictedImage:
-        """Predict one image, and write the files that need more than the pixels."""
+    def predict(self, job: Job, progress: Callable[[float], object]) -> tuple[Any, ...]:
+        """Predict one image, without waiting for the device; see `PredictedImage.fetch`."""
         image, files = self._upright(job.value), self.folder.files(job)
         mosaic = self._predictor.predict(image, progress, averaged="probabilities" in files)
-        predicted: PredictedImage = self._head.predicted(mosaic, image, files)
-        return predicted
+        self._head.write_mosaic(mosaic, image, files)
+        return image, mosaic.pixels(), mosaic.facts
 
     def write(self, job: Job) -> dict[str, Any]:
         """Write the results of one image; return its entry in the summary."""
-        predicted: PredictedImage = job.value
+        predicted = PredictedImage.fetch(*job.value)
         image, pixels, facts = predicted
         is_counted = np.array(True)
         if image.area is not None:

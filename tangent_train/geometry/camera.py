@@ -6,9 +6,10 @@ import math
 from numbers import Real
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tangent_train.errors import SettingError, check_type
+from tangent_train.geometry.sphere import Floats
 
 
 def half_width(fov_deg: float) -> float:
@@ -23,7 +24,7 @@ def half_width(fov_deg: float) -> float:
     return math.tan(math.radians(fov_deg) / 2)
 
 
-def camera_matrix_from_fov(fov_deg: float, size: tuple[int, int]) -> NDArray[np.float64]:
+def camera_matrix_from_fov(fov_deg: float, size: tuple[int, int]) -> Floats:
     """Return a pinhole matrix with square pixels and the center in the middle of the image.
 
     Args:
@@ -42,7 +43,7 @@ def camera_matrix_from_fov(fov_deg: float, size: tuple[int, int]) -> NDArray[np.
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
 
 
-def is_camera_matrix(matrix: NDArray[np.float64]) -> bool:
+def is_camera_matrix(matrix: Floats) -> bool:
     """Return True for a ``(3, 3)`` K without skew and with focal lengths above 0."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return False
@@ -50,7 +51,7 @@ def is_camera_matrix(matrix: NDArray[np.float64]) -> bool:
     return bool(is_plain and np.diag(matrix).min() > 0)
 
 
-def perspective_directions(camera_matrix: ArrayLike, size: tuple[int, int]) -> NDArray[np.float64]:
+def perspective_directions(camera_matrix: ArrayLike, size: tuple[int, int]) -> Floats:
     """Return unit directions of the pixel centers of a pinhole image, in camera axes.
 
     Args:
@@ -67,7 +68,7 @@ def perspective_directions(camera_matrix: ArrayLike, size: tuple[int, int]) -> N
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-def ray_lengths(camera_matrix: NDArray[np.float64], size: tuple[int, ...]) -> NDArray[np.float64]:
+def ray_lengths(camera_matrix: Floats, size: tuple[int, ...]) -> Floats:
     """Return the ratio of distance to z-depth for every pixel of an image, ``(height, width)``.
 
     Args:
@@ -81,7 +82,7 @@ def ray_lengths(camera_matrix: NDArray[np.float64], size: tuple[int, ...]) -> ND
     return lengths_of_rays(x, y)
 
 
-def lengths_of_rays(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+def lengths_of_rays(x: Floats, y: Floats) -> Floats:
     """Return √(1 + x² + y²) ``(…, h, w)`` for columns ``(…, w)`` and rows ``(…, h)``.
 
     They are positions on the image plane at distance 1, whose rays are (x, y, 1).
@@ -91,7 +92,7 @@ def lengths_of_rays(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[n
 
 def shift_range(
     camera_matrix: ArrayLike, size: tuple[int, int], fov_deg: float, crop: tuple[int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return the shifts of the principal point that keep the normalized crop inside the image.
 
     The crop's outer corners, moved by P = K K'⁻¹ and the shift δ, must stay inside the image

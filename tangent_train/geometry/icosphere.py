@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import at_least
-from tangent_train.geometry.sphere import lonlat_to_xyz
+from tangent_train.geometry.sphere import Floats, lonlat_to_xyz
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -36,7 +36,7 @@ class Icosphere(NamedTuple):
         faces: ``(F, 3)`` int64 vertex indices, all of one winding.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Floats
     faces: NDArray[np.int64]
 
 
@@ -141,9 +141,7 @@ def icosphere_count(level: int, elements: IcosphereElements = "vertices") -> int
 
 
 @lru_cache(maxsize=4)
-def icosphere_directions(
-    level: int, elements: IcosphereElements = "vertices"
-) -> NDArray[np.float64]:
+def icosphere_directions(level: int, elements: IcosphereElements = "vertices") -> Floats:
     """Return the directions of the vertices or of the faces' centers.
 
     The order is that of `icosphere`: the first vertices are those of the level below, and the
@@ -183,14 +181,12 @@ def _vertex_tree(level: int) -> cKDTree:
     return cKDTree(icosphere_directions(level))
 
 
-def nearest_vertices(level: int, directions_xyz: NDArray[np.float64]) -> NDArray[np.int64]:
+def nearest_vertices(level: int, directions_xyz: Floats) -> NDArray[np.int64]:
     """Return the vertex ``(P,)`` nearest to each direction ``(P, 3)``, a unit vector."""
     return np.asarray(_vertex_tree(level).query(directions_xyz)[1], np.int64)
 
 
-def locate(
-    level: int, directions_xyz: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def locate(level: int, directions_xyz: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Find the face that contains each direction, and barycentric weights of its vertices.
 
     Linear interpolation of values v at the vertices is ``(weights * v[faces[found]]).sum(1)``. As

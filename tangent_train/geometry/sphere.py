@@ -14,11 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError, at_least
 
+Floats = NDArray[np.float64]
+"""Directions, rotations and other float64 arrays."""
+
 MOST_ROWS = 2**15
 """Rows of a panorama, and sides of an image, at most: 2 gigapixels."""
 
 
-def lonlat_to_xyz(lonlat_rad: ArrayLike) -> NDArray[np.float64]:
+def lonlat_to_xyz(lonlat_rad: ArrayLike) -> Floats:
     """Return unit vectors of longitudes and latitudes.
 
     Args:
@@ -34,7 +37,7 @@ def lonlat_to_xyz(lonlat_rad: ArrayLike) -> NDArray[np.float64]:
     return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
 
 
-def xyz_to_lonlat(directions_xyz: ArrayLike) -> NDArray[np.float64]:
+def xyz_to_lonlat(directions_xyz: ArrayLike) -> Floats:
     """Return longitude in [−π, π] and latitude of directions; inverse of `lonlat_to_xyz`.
 
     Args:
@@ -47,7 +50,7 @@ def xyz_to_lonlat(directions_xyz: ArrayLike) -> NDArray[np.float64]:
     return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=-1)
 
 
-def to_right_handed(vectors_xyz: ArrayLike) -> NDArray[np.float64]:
+def to_right_handed(vectors_xyz: ArrayLike) -> Floats:
     """Return vectors of the sphere's frame, y to the right, with y to the left, and back.
 
     All files have the result's frame: point clouds, poses and cameras. Of a matrix that maps
@@ -59,7 +62,7 @@ def to_right_handed(vectors_xyz: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(np.asarray(vectors_xyz, np.float64) @ np.diag([1.0, -1.0, 1.0]))
 
 
-def rotation_about(axis_xyz: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
+def rotation_about(axis_xyz: ArrayLike, angle_rad: float) -> Floats:
     """Return the rotation by an angle about an axis (Rodrigues' formula).
 
     Args:
@@ -74,7 +77,7 @@ def rotation_about(axis_xyz: ArrayLike, angle_rad: float) -> NDArray[np.float64]
     return np.eye(3) + np.sin(angle_rad) * cross + (1 - np.cos(angle_rad)) * (cross @ cross)
 
 
-def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
+def random_rotation(rng: np.random.Generator) -> Floats:
     """Draw a rotation uniformly from SO(3) (a uniform unit quaternion).
 
     Args:
@@ -87,7 +90,7 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
     return rotation_about(axis, 2 * np.arctan2(np.linalg.norm(axis), w))
 
 
-def checked_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
+def checked_rotation(rotation: ArrayLike) -> Floats:
     """Return a copy of a rotation matrix.
 
     Args:
@@ -155,7 +158,7 @@ def nearest_level(height: int) -> int:
     return round(math.log2(height)) - 1
 
 
-def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
+def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> Floats:
     """Return longitude and latitude of ERP pixel positions.
 
     Args:
@@ -170,7 +173,7 @@ def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> NDArray[
     return np.stack([lon, np.pi / 2 - (v + 0.5) / shape[0] * np.pi], axis=-1)
 
 
-def lonlat_to_equirect(lonlat_rad: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
+def lonlat_to_equirect(lonlat_rad: ArrayLike, shape: tuple[int, int]) -> Floats:
     """Return ERP pixel positions of longitudes and latitudes; inverse of `equirect_to_lonlat`.
 
     Args:
@@ -185,7 +188,7 @@ def lonlat_to_equirect(lonlat_rad: ArrayLike, shape: tuple[int, int]) -> NDArray
     return np.stack([u, (np.pi / 2 - lat) / np.pi * shape[0] - 0.5], axis=-1)
 
 
-def equirect_latitudes(height: int, shift: float = 0.0) -> NDArray[np.float64]:
+def equirect_latitudes(height: int, shift: float = 0.0) -> Floats:
     """Return the latitude of every row, from north to south.
 
     Args:
@@ -198,7 +201,7 @@ def equirect_latitudes(height: int, shift: float = 0.0) -> NDArray[np.float64]:
     return np.pi / 2 - (np.arange(height) + shift + 0.5) / height * np.pi
 
 
-def equirect_longitudes(width: int, shift: float = 0.0) -> NDArray[np.float64]:
+def equirect_longitudes(width: int, shift: float = 0.0) -> Floats:
     """Return the longitude of every column, from west to east.
 
     Args:
@@ -211,7 +214,7 @@ def equirect_longitudes(width: int, shift: float = 0.0) -> NDArray[np.float64]:
     return (np.arange(width) + shift + 0.5) / width * 2 * np.pi - np.pi
 
 
-def equirect_directions(shape: tuple[int, int]) -> NDArray[np.float64]:
+def equirect_directions(shape: tuple[int, int]) -> Floats:
     """Return the direction of every ERP pixel center.
 
     Args:
@@ -247,7 +250,7 @@ def equirect_elevations(
     return elevations
 
 
-def equirect_solid_angles(shape: tuple[int, int]) -> NDArray[np.float64]:
+def equirect_solid_angles(shape: tuple[int, int]) -> Floats:
     """Return the exact solid angle of a pixel of every row: ``2π/W · (sin φ_top − sin φ_bottom)``.
 
     Args:
@@ -298,7 +301,7 @@ def area_mask(angles: Sequence[float], shape: tuple[int, int]) -> NDArray[np.boo
     return np.outer((south <= latitudes) & (latitudes <= north), (longitudes - west) % 360 <= width)
 
 
-def tangent_axes(directions_xyz: ArrayLike) -> NDArray[np.float64]:
+def tangent_axes(directions_xyz: ArrayLike) -> Floats:
     """Return east, north and the unit vector itself of each direction.
 
     Both poles have longitude 0: y points to the east of either.
@@ -319,7 +322,7 @@ def tangent_axes(directions_xyz: ArrayLike) -> NDArray[np.float64]:
 
 def gnomonic_points_xyz(
     directions_xyz: ArrayLike, kernel: int | tuple[int, int], pitch: float
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return where a convolution samples the sphere (Coors et al. 2018, Tateno et al. 2018).
 
     The points of a direction form a grid on its tangent plane, aligned to north: the inverse
@@ -367,12 +370,12 @@ class PanoramaPose:
         # A reflection times −1 is a rotation.
         checked_rotation(self.world_from_panorama * np.linalg.det(self.world_from_panorama))
 
-    def points_m(self, directions_xyz: ArrayLike, distance_m: ArrayLike) -> NDArray[np.float64]:
+    def points_m(self, directions_xyz: ArrayLike, distance_m: ArrayLike) -> Floats:
         """Return world points ``(…, 3)`` in directions ``(…, 3)`` at distances ``(…)``."""
         ahead = np.asarray(directions_xyz, np.float64) @ self.world_from_panorama.T
         return self.location_m + ahead * np.asarray(distance_m, np.float64)[..., None]
 
-    def project(self, points_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points_m: ArrayLike) -> tuple[Floats, Floats]:
         """Return directions ``(…, 3)`` and distances ``(…)`` in meters of world points ``(…, 3)``.
 
         A point at the center itself has the direction 0.
@@ -381,7 +384,7 @@ class PanoramaPose:
         distance = np.linalg.norm(offset, axis=-1)
         return offset / np.where(distance > 0, distance, 1.0)[..., None], distance
 
-    def relative_to(self, other: PanoramaPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def relative_to(self, other: PanoramaPose) -> tuple[Floats, Floats]:
         """Return rotation and shift from another panorama to this one: ``x_this = R x_other + t``.
 
         Args:

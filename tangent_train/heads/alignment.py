@@ -32,16 +32,16 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
-from torch.nn import functional
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, ray_lengths, xyz_to_lonlat
+from tangent_train.geometry.sphere import Floats
 from tangent_train.kinds import Align, DepthKind
 from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import Views
+from tangent_train.rendering.tensors import on_device
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 RAY_POWERS: dict[str, int] = {
@@ -216,19 +216,17 @@ def lattice(shape: tuple[int, int]) -> Indices:
 
 
 def sample_views(
-    outputs: NDArray[np.floating], views: Views, shape: tuple[int, int], points: Indices
+    outputs: Tensor, views: Views, shape: tuple[int, int], points: Indices
 ) -> ViewSamples:
     """Sample the output of a network at points of the canvas, bilinearly.
 
     Args:
-        outputs: ``(n, h, w)`` output for all views of the set.
+        outputs: ``(n, 1, h, w)`` output for all views of the set; only samples leave its device.
         views: The views.
         shape: ``(H, W)`` of the canvas: the panorama or photo.
         points: ``(P, 2)`` rows and columns of the canvas.
     """
-    placed, images = views.on_canvas(
-        torch.from_numpy(np.ascontiguousarray(outputs))[:, None], shape
-    )
+    placed, images = views.on_canvas(outputs, shape)
     height, width = placed.shape[-2:]
     geometry = images.geometry(shape, None)
     rows, columns = geometry.rows[points[:, 0]].T, geometry.columns[:, points[:, 1]]
@@ -237,17 +235,37 @@ def sample_views(
     with np.errstate(divide="ignore", invalid="ignore"):
         positions = (2 * np.stack([u, v], axis=-1) / w[..., None] + 1) / (width, height) - 1
     view, point = np.nonzero((np.abs(positions).max(axis=-1) <= 1) & (w > 0))
-    places = torch.from_numpy(np.where(np.isfinite(positions), positions, 0))[:, :, None]
+    position = positions[view, point]
+    index, weights = _bilinear(view, position, (len(placed), height, width))
+    taps = placed.flatten().index_select(0, on_device(index.ravel(), placed.device))
+    value = (taps.cpu().double().numpy().reshape(-1, 4) * weights).sum(axis=1)
+    of_images = views.ray_lengths()
+    index, weights = _bilinear(view, position, of_images.shape)
+    lengths = (of_images.ravel()[index] * weights).sum(axis=1)
+    value = np.where(np.isfinite(value), value, np.nan)
+    position = position if images is views else np.full_like(position, np.nan)
+    return ViewSamples(len(placed), view, point, value, lengths, position)
 
-    def sampled(pixels: Tensor) -> Floats:
-        """Return bilinear values ``(n,)`` of images ``(N, 1, h, w)``; NaN where not finite."""
-        how: Any = {"padding_mode": "border", "align_corners": False}
-        values = functional.grid_sample(pixels.double(), places, **how)[view, 0, point, 0].numpy()
-        return np.where(np.isfinite(values), values, np.nan)
 
-    lengths = torch.from_numpy(views.ray_lengths())[:, None].expand(len(placed), -1, -1, -1)
-    position = positions[view, point] if images is views else np.full((len(view), 2), np.nan)
-    return ViewSamples(len(placed), view, point, sampled(placed), sampled(lengths), position)
+def _bilinear(view: Indices, position: Floats, shape: tuple[int, ...]) -> tuple[Indices, Floats]:
+    """Return flat indices and weights ``(m, 4)`` of the pixels around positions in images.
+
+    Args:
+        view: ``(m,)`` numbers of the images; one image is that of all.
+        position: ``(m, 2)`` see `ViewSamples`.
+        shape: ``(n, h, w)`` of the images.
+    """
+    count, *sides = shape
+    first, share = [], []
+    for side, at in zip(sides, position.T[::-1], strict=True):
+        place = (((at + 1) * side - 1) / 2).clip(0, side - 1)
+        first.append(np.minimum(place, max(0, side - 2)).astype(np.int64))
+        share.append(np.stack([1 - (place - first[-1]), place - first[-1]], axis=-1))
+    corner = (view * (count > 1) * sides[0] + first[0]) * sides[1] + first[1]
+    down, across = (min(1, side - 1) for side in sides)
+    steps = np.array([0, across, down * sides[1], down * sides[1] + across])
+    weights = share[0][:, :, None] * share[1][:, None]
+    return corner[:, None] + steps, weights.reshape(-1, 4)
 
 
 class Alignment(NamedTuple):
@@ -550,16 +568,20 @@ class AlignedMosaic:
         self._lengths = None if camera_matrix is None else ray_lengths(camera_matrix, shape)
         points = sphere_points(shape) if camera_matrix is None else lattice(shape)
         self._points = points if valid is None else points[valid[tuple(points.T)]]
-        self._parts: list[tuple[Views, Tensor, Tensor]] = []
+        self._parts: list[Tensor] = []
+        self._sets: list[tuple[Views, Tensor]] = []
 
     def add(self, outputs: Tensor, views: Views) -> None:
-        """Add some views, which together cover the image, once or several times.
+        """Add the next views of a set; sets must be complete.
 
         Args:
             outputs: Outputs of the network ``(n, 1, h, w)``.
             views: The views.
         """
-        self._parts.append((views, outputs, torch.from_numpy(views.ray_lengths()).to(outputs)))
+        self._parts.append(outputs)
+        if sum(map(len, self._parts)) == views.num_images:
+            self._sets.append((views.whole, torch.cat(self._parts)))
+            self._parts.clear()
 
     def distances(self) -> Tensor:
         """Return distances ``(H, W)`` from the center along the rays, NaN where unknown.
@@ -570,19 +592,23 @@ class AlignedMosaic:
         Raises:
             SettingError: The views cannot be aligned in this way.
         """
-        samples, depths = [], []
-        for views, outputs, lengths in self._parts:
-            depth, kind = depth_of_output(outputs, self._kind, lengths[:, None])
-            depths.append(depth)
-            array = depth[:, 0].cpu().numpy()
-            samples.append(sample_views(array, views, self._shape, self._points))
+        device = self._sets[0][1].device
+        all_lengths = [on_device(views.ray_lengths(), device) for views, _ in self._sets]
+        depths = [
+            depth_of_output(outputs, self._kind, lengths.to(outputs)[:, None])
+            for (_, outputs), lengths in zip(self._sets, all_lengths, strict=True)
+        ]
+        kind = depths[0][1]
+        samples = [
+            sample_views(depth, views, self._shape, self._points)
+            for (views, _), (depth, _) in zip(self._sets, depths, strict=True)
+        ]
         alignment = align_views(samples, kind, self._align)
-        unknown = [~outputs.isfinite() for _, outputs, _ in self._parts]
-        share = sum(int(part.sum()) for part in unknown) / sum(part.numel() for part in unknown)
+        finite = torch.cat([outputs.isfinite().flatten() for _, outputs in self._sets])
+        share = 1 - float(finite.double().mean())
         self.facts = alignment.facts | ({"not_finite": share} if share else {})
-        mosaic = MeanMosaic(self._shape, self._blend, device=depths[0].device)
-        first = 0
-        for (views, _, lengths), depth in zip(self._parts, depths, strict=True):
+        mosaic, first = MeanMosaic(self._shape, self._blend, device=device), 0
+        for (views, _), (depth, _), lengths in zip(self._sets, depths, all_lengths, strict=True):
             part = slice(first, first + len(views))
             mosaic.add(alignment.applied(depth, part, lengths), views)
             first = part.stop
@@ -603,7 +629,8 @@ class AlignedMosaic:
     def _median(self, distance: Tensor) -> float:
         """Return the median of known depth at points, by solid angle; 1 if all are unknown."""
         points = tuple(self._points.T)
-        values = distance.cpu().numpy()[points]
+        index = on_device(np.ravel_multi_index(points, self._shape), distance.device)
+        values = distance.flatten().index_select(0, index).cpu().numpy()
         lengths = np.ones(len(values)) if self._lengths is None else self._lengths[points]
         known = np.isfinite(values)
         if not known.any():

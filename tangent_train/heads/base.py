@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,20 @@ class PredictedImage(NamedTuple):
     image: Any
     pixels: NDArray[Any]
     facts: Mapping[str, Any] = NOTHING
+
+    @classmethod
+    def fetch(cls, image: Any, pixels: Tensor, facts: Mapping[str, Any]) -> Self:
+        """Wait for the prediction of an image, and copy it from its device.
+
+        Args:
+            image: Photo, or image of the whole sphere.
+            pixels: Prediction of all pixels of the image, see `Head.mosaic`.
+            facts: Numbers may be tensors too.
+        """
+        array = image.cut(pixels.cpu().numpy())
+        return cls(
+            image, array, {n: float(f) if isinstance(f, Tensor) else f for n, f in facts.items()}
+        )
 
     @property
     def solid_angles(self) -> NDArray[np.floating]:
@@ -205,7 +219,7 @@ class Head(nn.Module, ABC):
         Returns:
             An object with ``add(outputs, views)``, which adds the outputs ``(n, C, h, w)`` of some
             views, ``pixels()``, which returns the prediction ``(H, W)``, and ``facts`` about it.
-            ``not_finite`` is the share of the pixels of views whose outputs are NaN or infinite.
+            ``not_finite`` is the share of the pixels whose outputs are NaN or infinite.
         """
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Any:
@@ -258,17 +272,8 @@ class Head(nn.Module, ABC):
         """Prepare for predictions by those of some images; return a line to print, or ""."""
         return ""
 
-    def predicted(
-        self, mosaic: Any, image: Any, files: Mapping[str, Path] = NOTHING
-    ) -> PredictedImage:
-        """Return the predicted pixels of an image.
-
-        Args:
-            mosaic: The image, put together from views.
-            image: Panorama or photo.
-            files: Files of the image by kind. Those that need the mosaic are written at once.
-        """
-        return PredictedImage(image, image.cut(mosaic.pixels().cpu().numpy()), mosaic.facts)
+    def write_mosaic(self, mosaic: Any, image: Any, files: Mapping[str, Path]) -> None:
+        """Write files, by kind, that need more than the predicted pixels of an image."""
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write the predicted pixels and the pictures of one image, by kind."""

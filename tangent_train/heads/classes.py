@@ -12,7 +12,6 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from pydantic import Field, validate_call
 from torch import Tensor
@@ -20,7 +19,7 @@ from torch.nn.functional import cross_entropy, pad
 
 from datamodules.core.label_map import IMAGE_CLASS, PIXEL_CLASSES, ClassWeights
 from tangent_train.heads import pictures
-from tangent_train.heads.base import NOTHING, RGB, Head, PredictedImage, Scores
+from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
 from tangent_train.io.palette import class_colors
 from tangent_train.io.pixel_files import array_file, read_pixels
 from tangent_train.metrics import segmentation
@@ -101,16 +100,45 @@ class ClassesHead(Head):
         self.class_weights = torch.as_tensor(weights).to(self.class_weights)
 
     def loss_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
-        """Return the weighted cross-entropy, summed over pixels."""
-        return cross_entropy_sum(outputs, targets, self.class_weights, self.label_smoothing)
+        """Return the weighted cross-entropy, summed over pixels; label 0 is ignored.
+
+        Divided by the `loss_norm` of the same images, it is torch's weighted mean. Divided by the
+        norm of *all* images, chunks and processes, it is the share of these images in one mean.
+        """
+        how: dict[str, Any] = {"reduction": "sum", "label_smoothing": self.label_smoothing}
+        logits, labels = exact(outputs), targets.long() - 1
+        weights = self.class_weights.to(logits)
+        return cross_entropy(logits, labels, weights, ignore_index=-1, **how)
 
     def loss_norm(self, targets: Tensor) -> Tensor:
         """Return the sum of the class weights of the labeled pixels."""
-        return cross_entropy_norm(targets, self.class_weights)
+        # Not with torch.bincount, for which the host waits for a GPU.
+        label_weights = pad(exact(self.class_weights), (1, 0))
+        return label_weights.index_select(0, targets.flatten().int()).sum()
 
     def auxiliary_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
-        """Return the cross-entropy of coarser logits, see `auxiliary_sum`."""
-        return auxiliary_sum(outputs, targets, self.class_weights)
+        """Return the weighted cross-entropy of pixels, with logits of a coarser stage.
+
+        Each cell is compared with the class histogram of the pixels whose centers lie in it. This
+        is the cross-entropy of the pixels, each with the logits of its cell, without upsampling;
+        its norm is the `loss_norm` of the pixels.
+        """
+        logits = exact(outputs)
+        images, classes, *size = outputs.shape
+        rows, columns = (
+            # The cell of every pixel center along a side.
+            (2 * torch.arange(side, device=targets.device) + 1) * cells // (2 * side)
+            for side, cells in zip(targets.shape[1:], size, strict=True)
+        )
+        image = torch.arange(images, device=targets.device)[:, None, None]
+        cell = (image * size[0] + rows[:, None]) * size[1] + columns
+        bins = (cell * (classes + 1) + targets).flatten()
+        counts = logits.new_zeros(images * size[0] * size[1] * (classes + 1))
+        counts.scatter_add_(0, bins, counts.new_ones(()).expand(bins.numel()))
+        histograms = counts.view(images, *size, classes + 1)[..., 1:].movedim(-1, 1)
+        # Counts instead of probabilities: pixels weigh the same in cells with few and many of them.
+        weights = self.class_weights.to(logits)
+        return cross_entropy(logits, histograms, weights, reduction="sum")
 
     # Scores
 
@@ -217,20 +245,18 @@ class ClassesHead(Head):
         listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
         return f"Smallest confidence of each class: {listed}."
 
-    def predicted(
-        self, mosaic: Any, image: Any, files: Mapping[str, Path] = NOTHING
-    ) -> PredictedImage:
-        """Return the labels of an image; write the probabilities, which take much memory."""
-        if "probabilities" in files:
-            everywhere = np.arange(mosaic.shape[0]), np.arange(mosaic.shape[1])
-            rows, columns = everywhere if image.area is None else image.area.places()
-            shape = (len(rows), len(columns), len(self.class_names) - 1)
-            with array_file(files["probabilities"], shape, np.float16) as array:
-                for start in range(0, len(rows), _ROWS_AT_ONCE):
-                    part = slice(start, start + _ROWS_AT_ONCE)
-                    probabilities = mosaic.probabilities(rows[part]).cpu().numpy()
-                    array[part] = probabilities[:, columns, : shape[-1]]
-        return super().predicted(mosaic, image, files)
+    def write_mosaic(self, mosaic: Any, image: Any, files: Mapping[str, Path]) -> None:
+        """Write the probabilities of an image, which take much memory."""
+        if "probabilities" not in files:
+            return
+        everywhere = np.arange(mosaic.shape[0]), np.arange(mosaic.shape[1])
+        rows, columns = everywhere if image.area is None else image.area.places()
+        shape = (len(rows), len(columns), len(self.class_names) - 1)
+        with array_file(files["probabilities"], shape, np.float16) as array:
+            for start in range(0, len(rows), _ROWS_AT_ONCE):
+                part = slice(start, start + _ROWS_AT_ONCE)
+                probabilities = mosaic.probabilities(rows[part]).cpu().numpy()
+                array[part] = probabilities[:, columns, : shape[-1]]
 
     def read(self, file: Path) -> NDArray[Any]:
         """Read labels."""
@@ -295,10 +321,9 @@ class LabelMosaic(ScoreMosaic):
         self._head, self.valid = head, valid
 
     @property
-    def facts(self) -> Mapping[str, float]:
-        """The share of pixels without a class, see `ScoreMosaic.not_finite`, if there are any."""
-        share = self.not_finite
-        return {"not_finite": share} if share else NOTHING
+    def facts(self) -> Mapping[str, Tensor]:
+        """The share of pixels without a class, see `ScoreMosaic.not_finite`."""
+        return {"not_finite": self.not_finite}
 
     def pixels(self) -> Tensor:
         """Return labels ``(H, W)``, 0 where unknown."""
@@ -347,74 +372,11 @@ class ImageClassHead(Head):
 
     def scores(self, result: Any) -> Scores:
         """Return the accuracy over shapes, its mean over classes, and that of every class."""
-        found = segmentation.classification_scores(result)
-        means = {"accuracy": found.accuracy, "class_accuracy": found.class_accuracy}
-        return Scores(means, {"images": found.counts, "accuracy": found.of_class}, confusion=result)
-
-
-def cross_entropy_sum(
-    scores: Float[Tensor, "images classes height width"],
-    labels: UInt8[Tensor, "images height width"],
-    class_weights: Float[Tensor, " classes"],
-    label_smoothing: float = 0.0,
-) -> Tensor:
-    """Sum the weighted cross-entropy of pixels; unknown pixels (label 0) are ignored.
-
-    Divided by the `cross_entropy_norm` of the same images, it is torch's weighted mean. Divided by
-    the norm of *all* images, chunks and processes, it is the share of these images in one mean.
-
-    Args:
-        scores: Scores of the K classes, before a softmax.
-        labels: Labels from 1 to K; 0 is unknown.
-        class_weights: Weight of each class.
-        label_smoothing: Fraction of the target that is spread evenly over the classes.
-    """
-    logits, targets = exact(scores), labels.long() - 1
-    how: dict[str, Any] = {"reduction": "sum", "label_smoothing": label_smoothing}
-    return cross_entropy(logits, targets, class_weights.to(logits), ignore_index=-1, **how)
-
-
-def cross_entropy_norm(
-    labels: UInt8[Tensor, "images height width"], class_weights: Float[Tensor, " classes"]
-) -> Tensor:
-    """Sum the class weights of the labeled pixels, which needs no forward pass."""
-    # Not with torch.bincount, for which the host waits for a GPU.
-    label_weights = pad(exact(class_weights), (1, 0))
-    return label_weights.index_select(0, labels.flatten().int()).sum()
-
-
-def auxiliary_sum(
-    scores: Float[Tensor, "images classes rows columns"],
-    labels: UInt8[Tensor, "images height width"],
-    class_weights: Float[Tensor, " classes"],
-) -> Tensor:
-    """Sum the weighted cross-entropy of pixels, with scores of a coarser stage of a network.
-
-    Each cell is compared with the class histogram of the pixels whose centers lie in it. This is
-    the cross-entropy of the pixels, each with the scores of its cell, without upsampling the
-    scores; its norm is the `cross_entropy_norm` of the pixels.
-
-    Args:
-        scores: Scores of the cells, before a softmax; their size may differ from that of the
-            labels.
-        labels: Labels of the pixels from 1 to K; 0 is unknown and ignored.
-        class_weights: Weight of each class.
-    """
-    logits = exact(scores)
-    images, classes, *size = scores.shape
-    rows, columns = (
-        # The cell of every pixel center along a side.
-        (2 * torch.arange(side, device=labels.device) + 1) * cells // (2 * side)
-        for side, cells in zip(labels.shape[1:], size, strict=True)
-    )
-    image = torch.arange(images, device=labels.device)[:, None, None]
-    cell = (image * size[0] + rows[:, None]) * size[1] + columns
-    bins = (cell * (classes + 1) + labels).flatten()
-    counts = logits.new_zeros(images * size[0] * size[1] * (classes + 1))
-    counts.scatter_add_(0, bins, counts.new_ones(()).expand(bins.numel()))
-    histograms = counts.view(images, *size, classes + 1)[..., 1:].movedim(-1, 1)
-    # Counts instead of probabilities: pixels weigh the same in cells with few and many of them.
-    return cross_entropy(logits, histograms, class_weights.to(logits), reduction="sum")
+        # With an unknown class, which no shape has.
+        found = segmentation.segmentation_scores(np.pad(result, ((1, 0), (1, 0))))
+        means = {"accuracy": np.trace(result) / result.sum(), "class_accuracy": found.means["macc"]}
+        of_class = {"images": result.sum(axis=1), "accuracy": found.of_classes["accuracy"]}
+        return Scores(means, of_class, confusion=result)
 
 
 def exact(values: Tensor) -> Tensor:

@@ -181,17 +181,12 @@ class Network:
         self._predictor, self._up_likelihood = predictor, up_likelihood
 
     def __repr__(self) -> str:
-        """Return classes or kind of depth, inputs, views and device in one line."""
+        """Return classes or kind of depth, inputs and device in one line."""
         loaded, names = self.loaded, self.class_names[1:]
         shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
         predicts = f"{len(names)} classes ({shown})" if names else f"depth ({loaded.depth_kind})"
-        rows, columns = loaded.image_size
-        kind = str(loaded.representation["_target_"]).rpartition(".")[2]
-        return (
-            f"<Network of {predicts}, inputs {', '.join(loaded.inputs)}, "
-            f"trained at level {loaded.level} on {columns}×{rows} images of {kind}, "
-            f"on {self._predictor.device}>"
-        )
+        inputs = ", ".join(loaded.inputs)
+        return f"<Network of {predicts}, inputs {inputs}, on {self._predictor.device}>"
 
     @overload
     def labels(self, image: Tensor, **settings: Unpack[LabelSettings]) -> Tensor: ...
@@ -249,21 +244,16 @@ class Network:
         self,
         image: Picture,
         *,
-        fov: float | None = None,
-        area: Sequence[float] | None = None,
-        upright: Upright = None,
         mask: Mask | str | NDArray[Any] | Tensor = None,
-        eye: Eye | None = None,
+        **settings: Any,
     ) -> NDArray[Any] | Tensor:
         """Return the depth of every pixel: distance from the center, or z-depth in photos.
 
         Args:
             image: A panorama, or a photo.
-            fov: See `labels`.
-            area: See `labels`.
-            upright: ``pose`` aligns a panorama with gravity by the GPano tags of its file.
             mask: Pixels of a panorama that get NaN, see `labels`.
-            eye: See `labels`.
+            **settings: ``fov``, ``area``, ``upright`` and ``eye`` of `labels`. Of ``upright``, only
+                ``pose`` suits a depth network.
 
         Returns:
             ``(H, W)`` float32, NaN where unknown: an array, or a tensor. In meters for networks
@@ -275,7 +265,7 @@ class Network:
             SettingError: See `labels`; or the views cannot be aligned in this way.
         """
         self.loaded.check_predicts(DISTANCE, "Use labels() or probabilities() of this network.")
-        given = self._read(image, None, fov, area, upright, eye=eye)
+        given = self._read(image, **settings)
         found = self._predictor.predict(given).pixels().cpu().numpy()
         return _as_given(_masked(found, given, image, mask, np.nan), image)
 

@@ -25,12 +25,13 @@ from models.distortion_aware import make_ordinary
 from tangent_train.checkpoints.outputs import OutputNetwork, network_for_views, plain_output
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid
+from tangent_train.geometry.sphere import equirect_elevations
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import ViewSelector
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import CubemapRepresentation
 from tangent_train.rendering.resampling import resize
-from tangent_train.rendering.tables import sphere_rays
+from tangent_train.rendering.tensors import on_device
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
 
     from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.heads import Head
-    from tangent_train.rendering import Interpolation
     from tangent_train.rendering.representations.views import Views
 
     ViewImages = Callable[[slice], Tensor]
@@ -140,47 +140,54 @@ class RenderedViews:
         contiguous = torch.contiguous_format
         self._format = contiguous if weights is None else torch.channels_last
         self._dtype = torch.float32 if weights is None else weights.dtype
-        self._loaded, self._shape, self._device = loaded, shape, device
+        self._loaded, self._device = loaded, device
         self._arrays = renders_arrays(device)
         self._image = image.resized(shape) if self._arrays else image
-        self._planes = () if self._arrays else tuple(self._input_planes())
+        self._panorama = torch.empty(0) if self._arrays else self._normalized(shape)
+        self._rendered: tuple[Views | None, Tensor] = None, self._panorama
 
-    def _input_planes(self) -> Iterator[tuple[Tensor, Interpolation]]:
-        """Yield the inputs on the device: RGB ``(3, H, W)`` from 0 to 255; others ``(1, H, W)``."""
-        image, shape, inputs = self._image, self._shape, self._loaded.inputs
-        rgb = torch.from_numpy(np.ascontiguousarray(image.rgb)).to(self._device).movedim(-1, 0)
-        yield resize(rgb.float(), shape, "bilinear").round_(), "bilinear"
+    def _normalized(self, shape: tuple[int, int]) -> Tensor:
+        """Return the normalized inputs of the whole image on the device, ``(C, H, W)``."""
+        image, inputs, device = self._image, self._loaded.inputs, torch.device(self._device)
+        rgb = on_device(image.rgb, device).movedim(-1, 0)
+        if image.shape != shape:
+            rgb = resize(rgb.float(), shape, "bilinear")
+        planes = [rgb.movedim(0, -1)]
         if "depth" in inputs and image.depth is not None:
             steps = np.minimum(resize_depth(image.depth, shape), int(MAX_DEPTH_M * STEPS_PER_M))
-            yield torch.from_numpy(steps.view(np.int16))[None].to(self._device), "nearest"
+            planes.append(on_device(steps.view(np.int16), device))
         if "elevation" in inputs:
             up = np.array((0.0, 0.0, 1.0)) if image.up is None else image.up
-            columns, rows = sphere_rays(shape)
-            level, lines = (torch.from_numpy(a).to(self._device) for a in (up[:2] @ columns, rows))
-            elevation = torch.outer(lines[:, 0], level) + lines[:, 1:] * float(up[2])
-            yield elevation[None].float(), "bilinear"
+            planes.append(on_device(equirect_elevations(shape, up), device))
+        return normalize(planes, self._loaded.normalization, inputs)
 
     def __call__(self, views: Views) -> Tensor:
         """Return normalized views ``(n, C, h, w)``."""
         inputs = self._loaded.inputs
         if self._arrays:
-            rendered: Any = render_inputs(self._image, views, inputs)
-        else:
-            colors, *others = (views.render(plane, how) for plane, how in self._planes)
-            rendered = colors.round().movedim(1, -1), *(plane[:, 0] for plane in others)
-        images = normalize(rendered, self._loaded.normalization, inputs)
-        return images.to(self._dtype).contiguous(memory_format=self._format)
+            rendered = render_inputs(self._image, views, inputs)
+            images = normalize(rendered, self._loaded.normalization, inputs)
+            return images.to(self._dtype, memory_format=self._format)
+        if "depth" not in inputs:
+            return views.render(self._panorama, "bilinear").to(self._dtype)
+        colors, depth, elevations = self._panorama.tensor_split((3, 4))
+        parts = [views.render(colors, "bilinear"), views.render(depth, "nearest")]
+        if len(elevations):
+            parts.append(views.render(elevations, "bilinear"))
+        return torch.cat(parts, dim=1).to(self._dtype)
 
     def of(self, views: Views) -> ViewImages:
-        """Return a function that renders some of the views."""
-        reduced = copy.copy(self)
+        """Return a function that renders some of the views; on a GPU all at the first call."""
         if self._arrays:
+            reduced = copy.copy(self)
             reduced._image = replace(self._image, rgb=views.reduced(self._image.rgb))
-        reduced._planes = tuple(
-            (views.reduced(plane) if how == "bilinear" else plane, how)
-            for plane, how in self._planes
-        )
-        return lambda part: reduced(views[part])
+            return lambda part: reduced(views[part])
+        return partial(self._part, views)
+
+    def _part(self, views: Views, part: slice) -> Tensor:
+        if self._rendered[0] is not views:  # one set at a time is kept
+            self._rendered = views, self(views)
+        return self._rendered[1][part]
 
 
 class Predictor:

@@ -25,11 +25,9 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
     xyz_to_lonlat,
 )
+from tangent_train.geometry.sphere import Floats
 from tangent_train.rendering import equirect_to_tangent
 from tangent_train.rendering.resampling import reduce_to_pitch
-
-Floats = NDArray[np.float64]
-"""Directions, rotations and other float64 arrays."""
 
 _cv2: Any = cv2  # its types lack the detectors
 

@@ -142,36 +142,3 @@ def _checked(indices: Tensor, num_classes: int) -> Tensor:
             "class index", found=f"{least} to {greatest}", expected=f"0 to {num_classes - 1}"
         )
     return indices.long()
-
-
-class ClassificationScores(NamedTuple):
-    """Scores of one confusion matrix.
-
-    Attributes:
-        accuracy: Share of images that were classified correctly.
-        class_accuracy: Mean of `of_class`, in which all classes have the same weight.
-        of_class: ``(K,)`` share of each class's images that were classified correctly; NaN for
-            classes that do not occur, which are left out of the mean.
-        counts: ``(K,)`` number of images of each class.
-    """
-
-    accuracy: float
-    class_accuracy: float
-    of_class: NDArray[np.float64]
-    counts: NDArray[np.int64]
-
-
-def classification_scores(confusion: ArrayLike) -> ClassificationScores:
-    """Compute classification scores of a whole data set.
-
-    Args:
-        confusion: ``(K, K)`` counts; rows are the true classes, columns the predicted ones.
-
-    Returns:
-        The scores; NaN without images.
-    """
-    matrix = np.asarray(confusion, np.int64)
-    counts, hits = matrix.sum(axis=1), matrix.diagonal()
-    of_class = np.where(counts > 0, hits / np.maximum(counts, 1), np.nan)
-    accuracy = float(hits.sum() / counts.sum()) if counts.any() else np.nan
-    return ClassificationScores(accuracy, float(defined_mean(of_class)), of_class, counts)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, equirect_solid_angles, rotation_about
+from tangent_train.geometry.sphere import Floats
 from tangent_train.orientation.manhattan import (
     LineSegments,
     ManhattanFrame,
@@ -21,7 +22,7 @@ from tangent_train.orientation.manhattan import (
     segment_weights,
 )
 
-UpLikelihood = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+UpLikelihood = Callable[[Floats], Floats]
 """Maps directions ``(n, 3)`` to log-likelihoods ``(n,)`` of being up, up to a constant."""
 
 _EVEN_CHANCE = 3.1  # significance at which half of the frames are right
@@ -59,7 +60,7 @@ _ODD = np.array([-3.8, -7.0, 0.35])
 
 def estimate_up(
     rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0, likelihood: UpLikelihood | None = None
-) -> NDArray[np.float64] | None:
+) -> Floats | None:
     """Estimate the direction of up from the straight edges of rooms and buildings.
 
     Most straight edges follow three directions at right angles, and one of them is the vertical.
@@ -106,7 +107,7 @@ def _candidates(
     frames: list[ManhattanFrame],
     lowest: float,
     likelihood: UpLikelihood | None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return possible directions of up ``(n, 3)`` and their probabilities ``(n,)``."""
     # A logit model over all frames and "no frame"; frames with the same vertical add up.
     odds = [math.exp(_STEEPNESS * (frame.significance - _EVEN_CHANCE)) for frame in frames]
@@ -135,9 +136,7 @@ def _candidates(
     return directions, chances / (1 + sum(odds))
 
 
-def up_probabilities(
-    rgb: NDArray[np.uint8], segments: LineSegments, axes_xyz: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def up_probabilities(rgb: NDArray[np.uint8], segments: LineSegments, axes_xyz: Floats) -> Floats:
     """Return the probability that each direction of a frame is up, for arbitrary rotations.
 
     Rooms have vertical edges all around, at eye level and below; clutter below; few edges straight
@@ -158,9 +157,7 @@ def up_probabilities(
     return chances / chances.sum()
 
 
-def cues(
-    rgb: NDArray[np.uint8], segments: LineSegments, axes_xyz: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def cues(rgb: NDArray[np.uint8], segments: LineSegments, axes_xyz: Floats) -> tuple[Floats, Floats]:
     """Return ``(3, 5)`` even and ``(3, 3)`` odd features of axes, in the order of the weights."""
     weights = segment_weights(segments)
     column, agreement = followed_axes(segments, axes_xyz)
@@ -185,22 +182,22 @@ def cues(
     return np.array(even), np.array(odd)
 
 
-def _mean(values: NDArray[Any], weights: NDArray[np.float64]) -> complex:
+def _mean(values: NDArray[Any], weights: Floats) -> complex:
     return (values @ weights) / max(weights.sum(), 1e-9)
 
 
-def _light(rgb: NDArray[np.uint8], axes_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+def _light(rgb: NDArray[np.uint8], axes_xyz: Floats) -> Floats:
     """Return how many standard deviations brighter each axis is than its opposite, ``(3,)``."""
     gray = cv2.cvtColor(cv2.resize(rgb, _SMALL[::-1], interpolation=cv2.INTER_AREA), _GRAY).ravel()
     area = np.repeat(equirect_solid_angles(_SMALL), _SMALL[1]) * (gray > 0) + 1e-9
     cosines = equirect_directions(_SMALL).reshape(-1, 3) @ axes_xyz
     above, below = (np.maximum(sign * cosines, 0) ** 2 * area[:, None] for sign in (1, -1))
     difference = gray @ above / above.sum(axis=0) - gray @ below / below.sum(axis=0)
-    spread: NDArray[np.float64] = np.sqrt(np.cov(gray, aweights=area))
+    spread: Floats = np.sqrt(np.cov(gray, aweights=area))
     return difference / max(1.0, float(spread))
 
 
-def upright_rotation(up: ArrayLike) -> NDArray[np.float64]:
+def upright_rotation(up: ArrayLike) -> Floats:
     """Return the smallest rotation R with ``R @ (0, 0, 1) = up``.
 
     The z axis of a grid rotated by it (``grid.with_rotation(R)``) points up, and
@@ -228,7 +225,7 @@ def upright_rotation(up: ArrayLike) -> NDArray[np.float64]:
     return rotation_about(axis, math.atan2(sine, z))
 
 
-def up_from_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
+def up_from_pose(pitch_deg: float, roll_deg: float) -> Floats:
     """Return the direction of up from `PosePitchDegrees` and `PoseRollDegrees` of a panorama.
 
     These are Google's Photo Sphere XMP metadata

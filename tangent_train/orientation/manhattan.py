@@ -6,16 +6,15 @@ Straight edges appear in a panorama as arcs of great circles. They are detected 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.geometry import CubeGrid, icosphere, rotation_about
+from tangent_train.geometry.sphere import Floats
 from tangent_train.rendering.forward import equirect_to_tangent
-
-_Float = TypeVar("_Float", bound=np.floating)
 
 MOST_ROWS = 512
 """Larger panoramas are resized to this number of rows."""
@@ -49,9 +48,9 @@ class LineSegments(NamedTuple):
         lengths_rad: ``(n,)`` lengths of the arcs.
     """
 
-    normals_xyz: NDArray[np.float64]
-    middles_xyz: NDArray[np.float64]
-    lengths_rad: NDArray[np.float64]
+    normals_xyz: Floats
+    middles_xyz: Floats
+    lengths_rad: Floats
 
 
 class ManhattanFrame(NamedTuple):
@@ -64,7 +63,7 @@ class ManhattanFrame(NamedTuple):
             reached about 1.5, and at most 2.
     """
 
-    axes_xyz: NDArray[np.float64]
+    axes_xyz: Floats
     significance: float
 
 
@@ -106,13 +105,12 @@ def _stretched(gray: NDArray[np.uint8], black: NDArray[np.uint8]) -> NDArray[np.
     counts = np.bincount(gray[black == 0], minlength=256).cumsum()
     low, high = np.searchsorted(counts, np.array([0.01, 0.99]) * counts[-1])
     steps = (np.arange(256) - low) * (255 / max(high - low, _LEAST_CONTRAST))
-    table: NDArray[np.uint8] = np.clip(steps, 0, 255).astype(np.uint8)
-    return table[gray]
+    return np.clip(steps, 0, 255).astype(np.uint8)[gray]
 
 
 def _seen_segments(
     detector: cv2.LineSegmentDetector, face: NDArray[np.uint8], unseen: NDArray[np.uint8]
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return ``(n, 2, 2)`` ends (x, y) of segments of a face, without rims of black areas."""
     found = detector.detect(face)[0]
     ends = np.zeros((0, 2, 2)) if found is None else found.reshape(-1, 2, 2).astype(np.float64)
@@ -124,7 +122,7 @@ def _seen_segments(
     return ends
 
 
-def _arcs(ends_xyz: NDArray[np.float64]) -> LineSegments:
+def _arcs(ends_xyz: Floats) -> LineSegments:
     """Return the longest arcs, given the directions of their ends, ``(n, 2, 3)``."""
     ends = ends_xyz / np.linalg.norm(ends_xyz, axis=-1, keepdims=True)
     normals = np.cross(ends[:, 0], ends[:, 1])
@@ -137,14 +135,12 @@ def _arcs(ends_xyz: NDArray[np.float64]) -> LineSegments:
     return LineSegments(normals[order] / sines[order, None], middles, lengths[order])
 
 
-def segment_weights(segments: LineSegments) -> NDArray[np.float64]:
+def segment_weights(segments: LineSegments) -> Floats:
     """Return ``(n,)`` weights: lengths in radians, at most half a radian."""
     return np.minimum(segments.lengths_rad, _LONGEST_RAD)
 
 
-def followed_axes(
-    segments: LineSegments, axes_xyz: NDArray[np.float64]
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def followed_axes(segments: LineSegments, axes_xyz: Floats) -> tuple[NDArray[np.intp], Floats]:
     """Assign each segment to an axis, with a measure of agreement.
 
     Args:
@@ -187,9 +183,8 @@ def find_manhattan_frames(segments: LineSegments) -> list[ManhattanFrame]:
     return sorted(frames, key=lambda frame: -frame.significance)
 
 
-def _agreement(cosines: NDArray[_Float], tolerance: float) -> NDArray[_Float]:
-    agreement: NDArray[_Float] = np.maximum(0, 1 - (cosines / tolerance) ** 2)
-    return agreement
+def _agreement(cosines: NDArray[Any], tolerance: float) -> NDArray[Any]:
+    return np.maximum(0, 1 - (cosines / tolerance) ** 2)
 
 
 @lru_cache(maxsize=1)
@@ -197,19 +192,15 @@ def _hemisphere() -> NDArray[np.float32]:
     """Return ``(1286, 3)`` directions about 4° apart: half of a sphere, and its rim."""
     vertices = icosphere(4).vertices
     directions = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    half: NDArray[np.float32] = directions[directions[:, 2] > -1e-9].astype(np.float32)
-    half.setflags(write=False)
-    return half
+    return directions[directions[:, 2] > -1e-9].astype(np.float32)
 
 
-def _first_axes(
-    normals: NDArray[np.float64], weights: NDArray[np.float64]
-) -> list[NDArray[np.float64]]:
+def _first_axes(normals: Floats, weights: Floats) -> list[Floats]:
     """Return directions that many segments follow, the best first, at least 6° apart."""
     directions = _hemisphere()
     agreement = _agreement(np.abs(directions @ normals.T.astype(np.float32)), _SEARCH_TOLERANCE)
     scores = agreement @ weights.astype(np.float32)
-    axes: list[NDArray[np.float64]] = []
+    axes: list[Floats] = []
     while len(axes) < _FIRST_AXES and (best := int(scores.argmax())) >= 0 and scores[best] > 0:
         axis = directions[best].astype(np.float64)
         axes.append(axis / np.linalg.norm(axis))
@@ -217,9 +208,7 @@ def _first_axes(
     return axes
 
 
-def _around(
-    axis: NDArray[np.float64], normals: NDArray[np.float64], weights: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64]]:
+def _around(axis: Floats, normals: Floats, weights: Floats) -> tuple[float, Floats]:
     """Return the score of the best frame with a given axis, and the frame, in steps of a degree."""
     second = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     second /= np.linalg.norm(second)
@@ -235,9 +224,7 @@ def _around(
     return float(score), axes
 
 
-def _refined(
-    axes: NDArray[np.float64], normals: NDArray[np.float64], weights: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _refined(axes: Floats, normals: Floats, weights: Floats) -> Floats:
     """Return a frame rotated to the best agreement with the segments that follow it."""
     for tolerance in _REFINEMENTS:
         cosines = normals @ axes
@@ -254,13 +241,11 @@ def _refined(
     return axes
 
 
-def _same(axes: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+def _same(axes: Floats, others: Floats) -> bool:
     return bool((np.abs(axes.T @ others).max(axis=0) > _APART).all())
 
 
-def _assessed(
-    axes: NDArray[np.float64], segments: LineSegments, weights: NDArray[np.float64]
-) -> ManhattanFrame:
+def _assessed(axes: Floats, segments: LineSegments, weights: Floats) -> ManhattanFrame:
     _, agreement = followed_axes(segments, axes)
     support = (weights * agreement).sum() / weights.sum()
     number = weights.sum() ** 2 / (weights**2).sum()

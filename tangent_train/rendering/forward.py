@@ -1,6 +1,6 @@
 """Render panoramas to tangent images, and to rotated panoramas.
 
-Arrays are sampled by `sample_map`, tensors by `sample_tensor`.
+Arrays are sampled by `sample_map`, tensors by `tensors.render_tensor`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from tangent_train.errors import SettingError, check_choice, check_type
 from tangent_train.geometry import Angles, PinholeGrid, checked_rotation, perspective_grid
@@ -22,12 +21,16 @@ from tangent_train.geometry.grids import Faces
 from tangent_train.rendering.resampling import Interpolation, Pixels, reduce_to_pitch
 from tangent_train.rendering.tables import (
     EquirectMap,
-    Positions,
     forward_map,
-    forward_positions,
     map_dtype,
     positions_of_rays,
     sphere_rays,
+)
+from tangent_train.rendering.tensors import (
+    nearest_equirect_index,
+    on_device,
+    render_tensor,
+    sample_tensor,
 )
 from tangent_train.rendering.traced import is_traced, traceable, traced
 
@@ -81,17 +84,10 @@ def equirect_to_tangent(
     if interpolation == "bilinear":
         image = reduce_to_pitch(image, grid.pitch)
     indices, (rows, columns) = grid.face_indices(faces), grid.size
+    if isinstance(image, Tensor):
+        return render_tensor(image, grid, indices, interpolation)
     # For random subsets of images, tables are cached per image: subsets rarely repeat.
     is_together = faces is None or grid.rotation is not None
-    if isinstance(image, Tensor):
-        step = len(indices) if is_together else 1
-        positions = [
-            forward_positions(grid, image, part, interpolation)
-            for part in np.split(indices, range(step, len(indices), max(1, step)))
-        ]
-        u, v = (torch.cat(lines) for lines in zip(*positions, strict=True))
-        values = _sampled(image, (u, v), interpolation)
-        return values.unflatten(-1, (len(indices), rows, columns)).movedim(-3, -4)
     image = np.ascontiguousarray(image)
     step = max(1, _TOGETHER // max(rows * columns, 4 * rows)) if is_together else 1
     out = np.empty((len(indices) * rows, columns, *image.shape[2:]), image.dtype)
@@ -142,15 +138,6 @@ def perspective(
     return images
 
 
-def _sampled(image: Tensor, positions: Positions, interpolation: Interpolation) -> Tensor:
-    """Return values ``(..., P)`` of a panorama ``(..., H, W)`` at P columns and rows."""
-    u, v = positions
-    shape = image.shape[-2], image.shape[-1]
-    if interpolation == "nearest":
-        return image.flatten(-2)[..., nearest_equirect_index(u, v, shape)]
-    return sample_tensor(image.flatten(0, -3), u, v).unflatten(0, image.shape[:-2])
-
-
 def rotate_equirect(
     image: Pixels, rotation: ArrayLike, interpolation: Interpolation = "bilinear"
 ) -> Pixels:
@@ -174,8 +161,11 @@ def rotate_equirect(
     height, width = image.shape[-2:] if isinstance(image, Tensor) else image.shape[:2]
     table = _rotation_map(rotated, (height, width), map_dtype(is_exact, interpolation))
     if isinstance(image, Tensor):
-        u, v = (torch.from_numpy(line.ravel()).to(image.device) for line in table[:2])
-        return _sampled(image, (u, v), interpolation).reshape(image.shape)
+        u, v = (on_device(line.ravel(), image.device) for line in table[:2])
+        if interpolation == "nearest":
+            index = nearest_equirect_index(u, v, (height, width))
+            return image.flatten(-2).index_select(-1, index).reshape(image.shape)
+        return sample_tensor(image.flatten(0, -3), u, v).reshape(image.shape)
     out = np.empty_like(image, order="C")
     sample_map(table, np.ascontiguousarray(image), interpolation, out)
     return out
@@ -273,55 +263,6 @@ def _interpolated(image: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> NDAr
     values = sample_tensor(torch.from_numpy(planes), columns, rows).numpy().T
     values = np.rint(values) if image.dtype.kind in "ui" else values
     return values.reshape(*u.shape, *image.shape[2:])
-
-
-def sample_tensor(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Interpolate a panorama bilinearly, differentiably on any device.
-
-    Longitude wraps. A row beyond a pole is the reflected row, shifted by half a revolution.
-
-    Args:
-        image: ``(C, H, W)`` floating-point values.
-        u: ``(P,)`` columns in [−1, 2 W].
-        v: ``(P,)`` rows in [−½, H − ½].
-
-    Returns:
-        ``(C, P)`` values of the dtype of the image.
-    """
-    height, width = image.shape[-2:]
-    planes = image if image.dtype == torch.float64 else image.float()
-    beyond = [_half_revolution(planes[:, [row]]) for row in (0, -1)]
-    tall = torch.cat([beyond[0], planes, beyond[1]], dim=1)
-    padded = torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=2)
-    x = (2 * torch.where(u < width, u, u - width) + 3) / (width + 2) - 1
-    positions = torch.stack([x, (2 * v + 3) / (height + 2) - 1], dim=-1)[None, None]
-    with torch.autocast(image.device.type, enabled=False):
-        values = grid_sample(
-            padded[None], positions.to(planes.dtype), padding_mode="border", align_corners=False
-        )
-    return values[0, :, 0].to(image.dtype)
-
-
-def _half_revolution(row: Tensor) -> Tensor:
-    """Return a row ``(C, 1, W)`` rotated by 180°; means of two columns if W is odd."""
-    width = row.shape[-1]
-    return (row.roll(width // 2, -1) + row.roll((width + 1) // 2, -1)) / 2
-
-
-def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return the nearest pixel at positions in an ERP; half-way between two, the even one.
-
-    Args:
-        u: ``(P,)`` columns, any real number.
-        v: ``(P,)`` rows in [−½, H − ½].
-        shape: ``(H, W)``.
-
-    Returns:
-        ``(P,)`` int64 flat indices.
-    """
-    height, width = shape
-    row = v.round().long().clamp(0, height - 1)
-    return row * width + u.round().long() % width
 
 
 def check_interpolation(interpolation: str, blend: str = "nearest") -> None:

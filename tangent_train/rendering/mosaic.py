@@ -160,7 +160,7 @@ class ScoreMosaic(Mosaic):
         self._min_confidence = min_confidence
 
     @property
-    def not_finite(self) -> float:
+    def not_finite(self) -> Tensor:
         """Share of the pixels at which a view has a score that is NaN or infinite."""
         return self._backend.unknown() / math.prod(self.shape)
 

@@ -82,11 +82,11 @@ class NumbaSums:
             self._owned = images.key, images.owners(self._shape)
         return self._owned[1]
 
-    def unknown(self) -> int:
+    def unknown(self) -> Tensor:
         """Return the number of pixels at which a view has a score that is NaN or infinite."""
         if len(self.sums):
-            return int(np.isnan(self.sums[..., 0]).sum())
-        return int((self._labels == self._channels).sum())
+            return torch.tensor(np.isnan(self.sums[..., 0]).sum())
+        return torch.tensor((self._labels == self._channels).sum())
 
     def rows(self, rows: slice | NDArray[np.intp]) -> Tensor:
         """Return the sums ``(h, W, K)`` of some rows."""

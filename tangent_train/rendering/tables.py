@@ -18,7 +18,6 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid, equirect_latitudes, equirect_longitudes
@@ -26,8 +25,6 @@ from tangent_train.rendering import kernels
 from tangent_train.rendering.kernels import Array, njit_exact, over_rows
 
 Value = TypeVar("Value", bound=tuple[Any, ...])
-Positions = tuple[Tensor, Tensor]
-"""Columns and rows ``(P,)`` in a panorama."""
 Rays = tuple[Array, Array]
 """``(2, W)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""
 
@@ -137,12 +134,13 @@ def cached(
     return (_ROTATED if is_rotated else TABLES).get(key, build)
 
 
-def _cached(
+def cached_of(
     grid: PinholeGrid,
     key: tuple[Hashable, ...],
     build: Callable[[], Value],
     device: torch.device | None = None,
 ) -> Value:
+    """Return the table of a key and a grid, see `cached`."""
     return cached((grid, *key), build, is_rotated=grid.rotation is not None, device=device)
 
 
@@ -162,31 +160,18 @@ def forward_map(
     """
 
     def build() -> EquirectMap:
-        return EquirectMap.of(*_positions(grid, shape, faces, dtype), shape)
+        return EquirectMap.of(*positions_of_pixels(grid, shape, faces, dtype), shape)
 
-    return _cached(grid, ("forward", shape, tuple(faces.tolist()), dtype), build)
-
-
-def forward_positions(
-    grid: PinholeGrid, panorama: Tensor, faces: NDArray[np.int64], interpolation: str
-) -> Positions:
-    """Return columns and rows ``(P,)`` in a panorama ``(..., H, W)``, on its device."""
-    shape, device = (panorama.shape[-2], panorama.shape[-1]), panorama.device
-    dtype = map_dtype(panorama.dtype == torch.float64, interpolation)
-
-    def build() -> Positions:
-        u, v = _positions(grid, shape, faces, dtype)
-        return torch.from_numpy(u.ravel()).to(device), torch.from_numpy(v.ravel()).to(device)
-
-    return _cached(grid, ("positions", device, shape, tuple(faces.tolist()), dtype), build)
+    return cached_of(grid, ("forward", shape, tuple(faces.tolist()), dtype), build)
 
 
-def _positions(
+def positions_of_pixels(
     grid: PinholeGrid,
     shape: tuple[int, int],
     faces: NDArray[np.int64],
     dtype: np.dtype[np.floating],
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return positions in an ERP of the pixels of images, see `positions_of_rays`."""
     world_from_pixel = grid.world_from_camera[faces] @ np.linalg.inv(grid.camera_matrix)
     return positions_of_rays(world_from_pixel[..., [0, 2, 1]], plane_rays(grid.size), shape, dtype)
 
@@ -203,7 +188,7 @@ def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
         over_rows(_write_owners, *shape, *mesh, *rays, face)
         return (face,)
 
-    return _cached(grid, ("owners", shape), build)[0]
+    return cached_of(grid, ("owners", shape), build)[0]
 
 
 def _inner_cosine(grid: PinholeGrid) -> float:
@@ -332,7 +317,7 @@ def _covered_spans(
         over_rows(_write_spans, shape[0], len(faces), edges, sphere_rays(shape)[1], shape[1], spans)
         return (spans,)
 
-    return _cached(grid, ("spans", shape, tuple(faces.tolist())), build)[0]
+    return cached_of(grid, ("spans", shape, tuple(faces.tolist())), build)[0]
 
 
 @njit_exact

@@ -19,6 +19,7 @@ import torch
 from torch.nn.functional import embedding_bag
 
 from tangent_train.rendering.tables import cached
+from tangent_train.rendering.tensors import on_device
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 _ENTRIES_AT_ONCE = 2**25
 """Largest number of entries of a matrix, 256 MiB; a canvas with more is divided by rows."""
 
-_SCORES_AT_ONCE = 2**28
-"""Number of sums that are held at once if only labels are kept, 1 GiB."""
+_SCORES_AT_ONCE = 2**29
+"""Number of sums that are held at once if only labels are kept, 2 GiB."""
 
 _PIXELS_AT_ONCE = 2**21
 """Number of pixels whose positions are computed at once."""
@@ -174,9 +175,9 @@ class TorchSums:
                 math.ceil(values.shape[1] * math.prod(self._shape) / _SCORES_AT_ONCE)
             )
             best = [self._best(matrix.sums(values, part)) for part in parts]
-            self._labels = torch.cat(best)
+            self._labels = _joined(best)
             return
-        sums = torch.cat([matrix.sums(values, part) for part in matrix.parts()])
+        sums = _joined([matrix.sums(values, part) for part in matrix.parts()])
         if self._softmax and not self._is_feathered:
             sums = sums.masked_fill(sums.amax(dim=-1, keepdim=True) < -_LARGEST, math.nan).softmax(
                 -1
@@ -199,12 +200,12 @@ class TorchSums:
             self._sums = torch.zeros(size, dtype=self._dtype, device=self._device)
         return self._sums
 
-    def unknown(self) -> int:
+    def unknown(self) -> Tensor:
         """Return the number of pixels at which a view has a score that is NaN or infinite."""
         self._finish()
         if self._averaged:
-            return int(self._total()[:, 0].isnan().sum())
-        return int((self._labels == self._channels).sum())
+            return self._total()[:, 0].isnan().sum()
+        return (self._labels == self._channels).sum()
 
     def rows(self, rows: slice | NDArray[np.intp]) -> Tensor:
         """Return the sums ``(h, W, K)`` of some rows."""
@@ -271,7 +272,7 @@ class _Matrix:
 
     def _owned(self, top: int, bottom: int) -> Taps:
         """Return taps in the owner of each pixel."""
-        owner = self._on_device(self._canvas.owner[top:bottom].astype(np.int64).ravel())
+        owner = on_device(self._canvas.owner[top:bottom].astype(np.int64).ravel(), self._device)
         flat = torch.arange(top * self._shape[1], bottom * self._shape[1], device=self._device)
         parts = [
             self._bilinear(image, self._offsets(image, pixels))
@@ -288,7 +289,8 @@ class _Matrix:
         height, width = bottom - top, self._shape[1]
         first_column, counts = self._canvas.spans[:, top:bottom].astype(np.int64).reshape(-1, 2).T
         ends = counts.cumsum()
-        shifts, ends_there = self._on_device(first_column - (ends - counts)), self._on_device(ends)
+        there = (on_device(part, self._device) for part in (first_column - (ends - counts), ends))
+        shifts, ends_there = there
         parts = []
         for start in range(0, int(ends[-1]), _PIXELS_AT_ONCE):
             stop = min(start + _PIXELS_AT_ONCE, int(ends[-1]))
@@ -339,7 +341,9 @@ class _Matrix:
         of_rows = (matrices[..., 2:] * canvas.rows[:, 1]).reshape(3, -1)
         dtype = np.float32 if self._device.type == "mps" else np.float64
         given = (of_columns, of_rows, canvas.rows[:, 0])
-        columns, rows, factors = (self._on_device(part.astype(dtype, copy=False)) for part in given)
+        columns, rows, factors = (
+            on_device(part.astype(dtype, copy=False), self._device) for part in given
+        )
         return columns, rows, factors
 
     def _offsets(self, image: Tensor, flat: Tensor) -> Tensor:
@@ -360,14 +364,13 @@ class _Matrix:
         xyz = torch.addcmul(down, factors.index_select(0, row), across)
         return (xyz[:2] / xyz[2]).masked_fill_(xyz[2] <= 0, 2)
 
-    def _on_device(self, array: NDArray[Any]) -> Tensor:
-        """Copy an array to the device; a GPU is not waited for."""
-        tensor = torch.from_numpy(np.ascontiguousarray(array))
-        pinned = tensor.pin_memory() if self._device.type == "cuda" else tensor
-        return pinned.to(self._device, non_blocking=True)
-
 
 def _as_slice(numbers: NDArray[np.int64]) -> slice | list[int]:
     """Return consecutive numbers as a slice, which is not a copy."""
     start, stop = int(numbers[0]), int(numbers[-1]) + 1
     return slice(start, stop) if stop - start == len(numbers) else numbers.tolist()
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """Concatenate tensors; one is not copied."""
+    return torch.cat(parts) if len(parts) > 1 else parts[0]

@@ -11,7 +11,7 @@ from torch import nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingLR, LinearLR, SequentialLR
 
-from tangent_train.errors import SettingError, at_least, check_choice
+from tangent_train.errors import SettingError
 
 _RATES = ("max_lr", "base_lr")
 """Arguments with which schedulers replace the learning rate of the optimizer."""
@@ -81,10 +81,6 @@ class Schedule:
     interval: Literal["epoch", "step"] = "epoch"
     frequency: int = 1
     monitor: str | None = None
-
-    def __post_init__(self) -> None:
-        check_choice("scheduler.interval", self.interval, ("epoch", "step"))
-        at_least("scheduler.frequency", self.frequency, 1)
 
     def length(self, trainer: Any) -> Any:
         """Return the epochs or steps of the schedule; None if it has no end."""

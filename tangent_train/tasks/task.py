@@ -108,22 +108,6 @@ class Task(lightning.LightningModule, ABC):
         self._pending: tuple[Tensor, Any, Any] | None = None
         self._step_norm: Any = None
 
-    @classmethod
-    def load_from_checkpoint(cls, checkpoint_path: Any, *arguments: Any, **named: Any) -> Self:
-        """Load a checkpoint into a task of the given network, representation and head.
-
-        Raises:
-            SettingError: They are not given.
-        """
-        if "network" not in named:
-            raise SettingError(
-                f"{cls.__name__}.load_from_checkpoint",
-                found="no network=",
-                expected="network, representation, head and optimizer of the run",
-                remedy="tt.load(checkpoint) builds the network from the checkpoint alone.",
-            )
-        return super().load_from_checkpoint(checkpoint_path, *arguments, **named)
-
     @abstractmethod
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
         """Return the inputs of the network and their targets, with a common first dimension."""
@@ -372,14 +356,13 @@ class PixelTask(Task):
         found = tuple(outputs["out"].shape)
         expected = (len(images), self.head.num_outputs, *images.shape[-2:])
         if found != expected:
-            name, remedy = "output of the network", ""
-            if found[2:] != expected[2:]:
-                remedy = (
-                    "A network returns a score for every pixel of its input: enlarge its output."
-                )
-            elif found[1:2] != expected[1:2]:
-                remedy = "Set network.num_classes to the number of classes, or to null."
-            raise SettingError(name, found=found, expected=expected, remedy=remedy)
+            remedy = (
+                "A network returns the scores of all classes (network.num_classes, or null for "
+                "those of the data) for every pixel of its input."
+            )
+            raise SettingError(
+                "output of the network", found=found, expected=expected, remedy=remedy
+            )
         return outputs
 
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:

@@ -63,7 +63,7 @@ def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys:
     scores = Predictor(trained, head_of(trained), ViewSelector(trained, levels=(7,))).predict(
         InputImage(rgb)
     )
-    labels = trained.labels(scores.labels())
+    labels = scores.pixels()
     scores_by_hand = rgb / 255 @ WEIGHT.T + BIAS
     expected = (
         scores_by_hand.argmax(axis=-1) if wins else scores_by_hand[..., 1:].argmax(axis=-1) + 1
@@ -117,7 +117,7 @@ def test_a_file_for_images_that_are_not_square(
     colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255]], np.uint8)
     rgb = colors[[0, 1, 2, 1]].repeat(32, axis=0)[None].repeat(64, axis=0)
     mosaic = Predictor(trained, head_of(trained), ViewSelector(trained)).predict(InputImage(rgb))
-    labels = trained.labels(mosaic.labels())
+    labels = mosaic.pixels()
     expected = (rgb / 255 @ WEIGHT.T + BIAS).argmax(axis=-1) + 1
     middle = np.arange(128).reshape(4, 32)[:, 10:22].ravel()  # away from the edges of the blocks
     np.testing.assert_array_equal(labels[16:48][:, middle], expected[16:48][:, middle])

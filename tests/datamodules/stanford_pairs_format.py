@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from datamodules.stanford2d3ds.files import euler_angles
 from datamodules.stanford2d3ds.pairs import published_pairs
 from tangent_train.geometry import rotation_about
 from tests.datamodules.data_files import write_png
@@ -63,7 +63,7 @@ def write_panorama(root: Path, camera: str, room: str, gray: int, rows: int = 8)
     record = {
         "camera_k_matrix": [[rows / 2, 0, rows / 2], [0, rows / 2, rows / 2], [0, 0, 1]],
         "camera_rt_matrix": np.hstack([rotation, -(rotation @ location)[:, None]]).tolist(),
-        "camera_original_rotation": euler_angles(upright).tolist(),
+        "camera_original_rotation": Rotation.from_matrix(upright).as_euler("xyz").tolist(),
         "camera_location": location.tolist(),
     }
     (pano / "pose" / f"{stem}_pose.json").write_text(json.dumps(record))

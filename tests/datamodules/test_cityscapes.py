@@ -15,7 +15,7 @@ from datamodules.core.files import SPLITS
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules import street_format as streets
-from tests.datamodules.data_files import names_of, read_png, write_png
+from tests.datamodules.data_files import names_of, read_png
 
 CROPS = PerspectiveRepresentation(level=6, dim=[16, 32])
 
@@ -67,15 +67,13 @@ def test_validation_takes_whole_training_cities(shared: Path) -> None:
     assert not names_of(photos(shared, val_fraction=0), "val")
 
 
-def test_a_check_finds_strays_and_missing_labels(root: Path) -> None:
-    write_png(root / "gtFine/train/ulm/ulm_9_gtFine_labelIds.png", np.ones((64, 128), np.uint8))
+def test_a_check_finds_missing_labels(root: Path) -> None:
     missing = root / "gtFine/train/aachen/aachen_000000_000000_gtFine_labelIds.png"
     missing.unlink()
     problems, count = photos(root).check()
     assert count == 4
     assert [problem.file for problem in problems.listed()] == [str(missing)]
     assert "found 3 train, 1 val; published are 2975 train, 500 val" in problems.warnings
-    assert any("1 without an image, e.g." in text for text in problems.warnings)
 
 
 def test_a_field_of_view_replaces_the_camera_files(root: Path) -> None:

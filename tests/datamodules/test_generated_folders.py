@@ -11,7 +11,7 @@ import pytest
 from datamodules.synthrooms.datamodule import SynthRooms, generate_rooms
 from datamodules.synthshapes import SynthShapes, generate_shapes
 from tangent_train.errors import DataError, SettingError
-from tangent_train.manifest import Manifest, Shard
+from tangent_train.manifest import Shard
 from tangent_train.rendering import TangentRepresentation
 from tests.datamodules.conftest import TINY_ROOMS, TINY_SHAPES
 from tests.datamodules.data_files import contents, names_of
@@ -37,14 +37,6 @@ def test_folders_of_other_settings_are_left_alone(tiny_rooms: Path, tiny_shapes:
                 generate_shapes(root, replace(TINY_SHAPES, seed=9))
             )
         assert contents(root) == before
-
-
-def test_two_parts_begun_at_once_have_the_same_settings(tmp_path: Path) -> None:
-    """Refused before the first shape is written."""
-    Manifest.open(tmp_path, {"generator": "SynthShapes"}, is_shared=True)
-    with pytest.raises(SettingError, match="expected null"):
-        generate_shapes(tmp_path, TINY_SHAPES)
-    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
 
 
 @pytest.mark.parametrize("module", [SynthRooms, SynthShapes])

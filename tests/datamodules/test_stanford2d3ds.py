@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.depth import distance_from_z_depth, steps_to_meters
+from datamodules.core.depth import distance_from_z_depth
 from datamodules.core.files import SPLITS
 from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,
     Stanford2D3DSPerspective,
-    read_depth,
     read_label_table,
 )
 from tangent_train.errors import DataError
@@ -81,9 +80,7 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
     assert classes.max() > 1
     np.testing.assert_array_equal(panorama.labels, classes)
     known = classes > 0
-    np.testing.assert_array_equal(
-        steps_to_meters(panorama.depth), np.where(known, 1 + (classes - 1) / 4, np.nan)
-    )
+    np.testing.assert_array_equal(panorama.depth, np.where(known, 512 + (classes - 1) * 128, 0))
     np.testing.assert_array_equal(panorama.rgb[..., 0], np.where(known, 5 + 15 * classes, 0))
     np.testing.assert_array_equal(panorama.rgb[..., 1], np.where(known, 245 - 15 * classes, 0))
     assert known.mean() == 7 / 8
@@ -136,13 +133,6 @@ def test_a_photo_is_what_the_files_hold(photo_root: Path) -> None:
     np.testing.assert_allclose(
         photo.camera_matrix, camera_matrix_from_fov(62, (32, 32)), err_msg="counted from centers"
     )
-
-
-def test_depth_of_8_bits_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "depth.png"
-    write_png(path, np.full((4, 8), 200, np.uint8))
-    with pytest.raises(DataError, match=r"found uint8 of shape .*expected depth"):
-        read_depth(path)
 
 
 def test_distances_saturate_and_holes_stay_holes() -> None:

@@ -7,8 +7,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from datamodules.stanford2d3ds.files import UNKNOWN_CLASS, euler_rotation
+from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
 from datamodules.synthrooms.datamodule import (
     INSTANCES,
     RoomPlan,
@@ -116,15 +117,18 @@ def test_poses_have_every_key_and_agree_with_themselves(panorama: bool) -> None:
     assert record["camera_uuid"] == record["point_uuid"] == CAMERA
     assert (record["room"], record["frame_num"]) == ("WC_17_5", frame)
     # As the real set's: Blender's camera looks along -z with +y up.
-    final = euler_rotation(np.array(record["final_camera_rotation"]))
+    first, between, final = Rotation.from_euler(
+        "xyz",
+        [
+            record["camera_original_rotation"],
+            record["rotation_from_original_to_point"],
+            record["final_camera_rotation"],
+        ],
+    ).as_matrix()
     rt = np.array(record["camera_rt_matrix"])
     np.testing.assert_allclose(rt[:, :3], np.diag([1, -1, -1]) @ final.T, atol=1e-12)
     np.testing.assert_allclose(rt[:, :3] @ record["camera_location"] + rt[:, 3], 0, atol=1e-12)
-    first, last = (
-        euler_rotation(np.array(record[key]))
-        for key in ("camera_original_rotation", "rotation_from_original_to_point")
-    )
-    np.testing.assert_allclose(last @ first, final, atol=1e-12)
+    np.testing.assert_allclose(between @ first, final, atol=1e-12)
     size = 64 if panorama else 100
     K = np.array(record["camera_k_matrix"])
     assert K[0, 2] == K[1, 2] == size / 2

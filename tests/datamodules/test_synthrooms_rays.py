@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.stanford2d3ds.files import euler_angles, euler_rotation
 from datamodules.synthrooms.furniture import build_empty_room
 from datamodules.synthrooms.render import (
     MISSING,
@@ -19,12 +18,7 @@ from datamodules.synthrooms.render import (
     render_picture,
 )
 from datamodules.synthrooms.room import FloorPlan, Light, Room
-from tangent_train.geometry import (
-    equirect_directions,
-    random_rotation,
-    rotation_about,
-    to_right_handed,
-)
+from tangent_train.geometry import equirect_directions, rotation_about, to_right_handed
 
 SIZE = np.array([5.0, 4.0, 3.0])
 HERE = np.array([1.5, 2.2, 1.4])
@@ -83,14 +77,6 @@ def test_unscanned_surfaces_have_a_color_but_no_label_or_depth() -> None:
 
 
 PLACE = np.array([1.0, 2.0, 1.5])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_euler_angles_give_their_rotation_back(seed: int) -> None:
-    rotation = random_rotation(np.random.default_rng(seed))
-    down = euler_rotation(np.array([0.3, math.pi / 2, 0.8]))  # two axes coincide
-    np.testing.assert_allclose(euler_rotation(euler_angles(down)), down, atol=1e-9)
-    np.testing.assert_allclose(euler_rotation(euler_angles(rotation)), rotation, atol=1e-12)
 
 
 def test_panorama_rays_are_the_sphere_mirrored_and_turned_by_the_heading() -> None:

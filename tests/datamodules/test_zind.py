@@ -96,24 +96,20 @@ def test_doors_may_be_unknown(root: Path) -> None:
     np.testing.assert_array_equal(ignored, np.where(labels == 4, 0, labels))
 
 
-BROKEN: dict[str, tuple[dict[str, Any], str]] = {
-    "no height": ({"camera_height": None}, "pano_1.camera_height=null, not a valid number"),
-    "a picture elsewhere": ({"image_path": "../other.jpg"}, "image_path=.*pattern"),
-    "half a door": (
-        {"layout_visible": {"doors": [[1]]}},
-        "layout_visible=nothing",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_home_is_named_with_its_place(root: Path, name: str) -> None:
-    change, expected = BROKEN[name]
-    file = _change(root, change)
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"camera_height": None}, "pano_1.camera_height=null, not a valid number"),
+        ({"image_path": "../other.jpg"}, "image_path=.*pattern"),
+    ],
+)
+def test_a_broken_home_is_named_with_its_place(
+    root: Path, change: dict[str, Any], expected: str
+) -> None:
+    _change(root, change)
     with pytest.raises(DataError, match=rf"000/zind_data\.json: found .*{expected}"):
         _zind(root).setup()
     assert _zind(root).check()[0].items == {"000"}
-    assert file.exists()
 
 
 def test_a_room_without_the_camera_is_left_out(root: Path) -> None:
@@ -126,12 +122,11 @@ def test_a_room_without_the_camera_is_left_out(root: Path) -> None:
     assert len(names_of(data, "test")) == 5
 
 
-def _change(root: Path, change: dict[str, Any]) -> Path:
+def _change(root: Path, change: dict[str, Any]) -> None:
     file = root / "000" / "zind_data.json"
     content = json.loads(file.read_text())
     content["merger"]["floor_01"]["complete_room_01"]["partial_room_01"]["pano_1"] |= change
     file.write_text(json.dumps(content))
-    return file
 
 
 # --- pairs ----------------------------------------------------------------------------------------

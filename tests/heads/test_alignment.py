@@ -80,7 +80,7 @@ class Truth(NamedTuple):
 @cache
 def _truth(name: str) -> Truth:
     points = sphere_points(SHAPE)[::4]
-    empty = [np.zeros((len(views), *views.grid.size)) for views in _sets(name)]
+    empty = [torch.zeros((len(views), 1, *views.grid.size)) for views in _sets(name)]
     parts = [sample_views(a, v, SHAPE, points) for a, v in zip(empty, _sets(name), strict=True)]
     samples = ViewSamples.joined(parts)
     rows, columns = points[samples.point].T
@@ -289,7 +289,7 @@ def test_views_are_sampled_where_the_canvas_is(name: str) -> None:
     rendered = views.render(torch.from_numpy(image[None].astype(np.float32)), "bilinear")
     outputs = rendered[:, 0].numpy()
     outputs[:, 5, 7] = np.inf
-    samples = sample_views(outputs, views, shape, points)
+    samples = sample_views(torch.from_numpy(outputs)[:, None], views, shape, points)
     assert samples.num_views == len(views)
     assert set(samples.point) == set(range(len(points)))  # the views cover the canvas
     rows, columns = points[samples.point].T
@@ -319,7 +319,7 @@ def test_a_grid_removes_smooth_errors_of_views() -> None:
     y, x = np.mgrid[-1:1:32j, -1:1:32j]
     bent = rng.normal(0, 0.2, (20, 2, 1, 1)) * (x * y, y**2)
     output = distance / lengths * np.exp(bent.sum(axis=1))
-    samples = sample_views(output, views, SHAPE, points)
+    samples = sample_views(torch.from_numpy(output)[:, None], views, SHAPE, points)
     plain: Any = align_views([samples], "metric_z", "scale")
     corrected: Any = align_views([samples], "metric_z", "grid")
     assert plain.facts["step_after"] > 0.05
@@ -329,12 +329,14 @@ def test_a_grid_removes_smooth_errors_of_views() -> None:
     raw, rays = torch.from_numpy(output[:, None]), torch.from_numpy(lengths)
     applied = np.exp(corrected.applied(raw, slice(0, 20), rays)[:, 0].numpy())
     again = align_views(
-        [sample_views(applied, views, SHAPE, points)], "metric_distance", "none"
+        [sample_views(torch.from_numpy(applied)[:, None], views, SHAPE, points)],
+        "metric_distance",
+        "none",
     ).facts
     assert again["step_before"] == pytest.approx(corrected.facts["step_after"], rel=0.1)
     assert again["step_after"] == again["step_before"]
 
-    exact = sample_views(distance / lengths, views, SHAPE, points)
+    exact = sample_views(torch.from_numpy(distance / lengths)[:, None], views, SHAPE, points)
     nothing: Any = align_views([exact], "metric_z", "grid")
     assert np.quantile(np.abs(nothing.grid), 0.9) < 0.02
 

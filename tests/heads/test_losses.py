@@ -7,8 +7,14 @@ import pytest
 import torch
 from torch.nn import functional
 
-from tangent_train.heads.classes import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
+from tangent_train.heads import ClassesHead
 from tangent_train.heads.distance import log_error_sum
+
+
+def _head(weights: torch.Tensor, smoothing: float = 0.0) -> ClassesHead:
+    head = ClassesHead(["unknown", *map(str, range(len(weights)))], label_smoothing=smoothing)
+    head.class_weights = weights
+    return head
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.1])
@@ -17,8 +23,8 @@ def test_sum_over_norm_is_the_weighted_mean(smoothing: float) -> None:
     scores = torch.randn(4, 5, 6, 7, generator=generator, dtype=torch.float64)
     labels = torch.randint(0, 6, (4, 6, 7), generator=generator).to(torch.uint8)
     weights = torch.rand(5, generator=generator, dtype=torch.float64) + 0.1
-    total = cross_entropy_sum(scores, labels, weights, smoothing)
-    norm = cross_entropy_norm(labels, weights)
+    head = _head(weights, smoothing)
+    total, norm = head.loss_sum(scores, labels), head.loss_norm(labels)
     known = labels > 0
     expected = functional.cross_entropy(
         scores.movedim(1, -1)[known], labels[known].long() - 1, weights, label_smoothing=smoothing
@@ -32,8 +38,8 @@ def test_half_precision_neither_overflows_nor_rounds(dtype: torch.dtype) -> None
     weights = torch.tensor([1.0, 3.0, 0.5])
     scores = torch.zeros(2, 3, 300, 301, dtype=dtype)
     with torch.autocast("cpu", dtype):
-        norms = [cross_entropy_norm(labels, given) for given in (weights, weights.to(dtype))]
-        mean = cross_entropy_sum(scores, labels, weights.to(dtype)) / norms[0]
+        norms = [_head(given).loss_norm(labels) for given in (weights, weights.to(dtype))]
+        mean = _head(weights.to(dtype)).loss_sum(scores, labels) / norms[0]
     assert [float(norm) for norm in norms] == [3 * labels.numel()] * 2
     assert float(mean) == pytest.approx(math.log(3), rel=1e-5)
 
@@ -47,12 +53,12 @@ def test_histograms_give_the_loss_of_enlarged_scores(size: tuple[int, int]) -> N
     generator = torch.Generator().manual_seed(0)
     labels = torch.randint(0, 6, (3, 12, 16), generator=generator).to(torch.uint8)
     scores = torch.randn(3, 5, *size, generator=generator, dtype=torch.float64).requires_grad_()
-    found = auxiliary_sum(scores, labels, WEIGHTS)
+    found = _head(WEIGHTS).auxiliary_sum(scores, labels)
     # Cells by the centers of the pixels, one by one.
     rows = [math.floor(Fraction(2 * r + 1, 2 * 12) * size[0]) for r in range(12)]
     columns = [math.floor(Fraction(2 * c + 1, 2 * 16) * size[1]) for c in range(16)]
     enlarged = scores[:, :, rows][:, :, :, columns]
-    expected = cross_entropy_sum(enlarged, labels, WEIGHTS)
+    expected = _head(WEIGHTS).loss_sum(enlarged, labels)
     torch.testing.assert_close(found, expected)
     gradients = (torch.autograd.grad(value, scores)[0] for value in (found, expected))
     torch.testing.assert_close(*gradients)

@@ -27,6 +27,7 @@ from datamodules.zind.layout import CLASSES as ZIND
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.checkpoints.outputs import Groups
 from tangent_train.errors import SettingError
+from tangent_train.heads import ClassesHead
 from tangent_train.inference.api import Unmapped, load_label_map, map_classes
 from tests.inference.trained import TANGENT, trained_network
 
@@ -112,7 +113,7 @@ def test_probabilities_of_a_class_add_up(unmapped: Unmapped, nothing: list[int] 
     best = expected.argmax(1)
     wanted = np.where(best == 4, 0, best + 1)
     assert (wanted == 0).any() == bool(blank)
-    labels = trained.labels(found.argmax(dim=1).byte())
+    labels = ClassesHead(trained.class_names).labels_of(found.argmax(dim=1))
     np.testing.assert_array_equal(labels, wanted)
 
 

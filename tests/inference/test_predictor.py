@@ -148,7 +148,7 @@ def test_convolutions_are_sampled_on_the_sphere_if_the_views_ask_for_it() -> Non
     area = (-90, 90, -30, 30)
     assert ViewSelector(plain).description(area) == "1 view of 64 × 32"
     assert ViewSelector(aware).description(area) == "1 view of 64 × 32"
-    with pytest.raises(SettingError, match=r"only images of 32 × 32 .* Import the network from"):
+    with pytest.raises(SettingError, match=r"features of 32 × 32 .*; expected whole equirect"):
         _labels(replace(aware, fixed_size=(32, 32)), image)
 
 
@@ -200,7 +200,7 @@ def test_pixels_of_low_confidence_are_unknown() -> None:
     best = probabilities.argmax(axis=-1)
     known = (best < 2) & (probabilities.max(axis=-1) >= 0.6)
     assert all(((best == k) & known).any() != (k == 2) for k in range(3))
-    np.testing.assert_array_equal(trained.labels(scores.labels()), np.where(known, best + 1, 0))
+    np.testing.assert_array_equal(scores.pixels(), np.where(known, best + 1, 0))
 
 
 def test_level_and_base_level_choose_the_views() -> None:

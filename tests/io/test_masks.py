@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules.core.image_module import draw_rotation
+from datamodules.core.dataset import draw_rotation
 from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions

@@ -11,10 +11,10 @@ from torchmetrics.classification import MulticlassAccuracy
 from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.errors import SettingError
+from tangent_train.heads import ImageClassHead
 from tangent_train.metrics.collected import ClassificationMetric, SegmentationMetric
 from tangent_train.metrics.scores import BAND_EDGES_DEG, bootstrap
 from tangent_train.metrics.segmentation import (
-    classification_scores,
     mean_scores,
     segmentation_scores,
 )
@@ -190,11 +190,11 @@ def test_scores_equal_torchmetrics_over_the_whole_data_set() -> None:
     matrix = metric.compute()
     for cell in np.ndindex(6, 6):
         assert matrix[cell] == ((truth == cell[0]) & (prediction == cell[1])).sum()
-    scores = classification_scores(matrix)
+    scores = ImageClassHead([str(k) for k in range(6)]).scores(matrix)
     overall = MulticlassAccuracy(6, average="micro")(prediction, truth)
-    assert scores.accuracy == pytest.approx(float(overall))
+    assert scores.means["accuracy"] == pytest.approx(float(overall))
     of_class = MulticlassAccuracy(6, average="none")(prediction, truth).numpy()
-    np.testing.assert_allclose(scores.of_class[:-1], of_class[:-1], rtol=1e-6)
-    assert np.isnan(scores.of_class[-1]), "it does not occur, and is left out of the mean"
-    assert scores.class_accuracy == pytest.approx(float(of_class[:-1].mean()))
-    assert scores.counts.sum() == 38
+    np.testing.assert_allclose(scores.of_classes["accuracy"][:-1], of_class[:-1], rtol=1e-6)
+    assert np.isnan(scores.of_classes["accuracy"][-1]), "absent, and left out of the mean"
+    assert scores.means["class_accuracy"] == pytest.approx(float(of_class[:-1].mean()))
+    assert scores.of_classes["images"].sum() == 38

@@ -12,21 +12,6 @@ from tests.models.sphere_networks import STAGE, small_unet
 from tests.tasks.odd_networks import Looking
 
 
-class _Twice(nn.Module):
-    """Runs one stage twice; the other gives two tensors."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.shared = nn.Conv2d(3, 3, 1)
-        self.last = nn.Conv2d(3, 5, 1)
-        self.pool = nn.MaxPool2d(2, return_indices=True)
-
-    def forward(self, images: Tensor) -> Tensor:
-        features: Tensor = self.last(self.shared(self.shared(images)))
-        self.pool(features)
-        return features
-
-
 @pytest.mark.parametrize(
     ("network", "stage", "in_channels", "channels"),
     [

@@ -16,7 +16,7 @@ from torch import Tensor
 from datamodules.core.label_map import LabelMap
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.errors import SettingError
-from tangent_train.heads import head_of
+from tangent_train.heads import ClassesHead, head_of
 from tangent_train.inference.api import map_classes
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
@@ -88,7 +88,7 @@ def test_label_maps_have_unknown_values(tmp_path: Path) -> None:
     path = write_linear(tmp_path / "net.onnx", WEIGHT, BIAS, ARGMAX)
     loaded = _imported(path, NAMES[:4], unknown_classes=["a"])
     assert loaded.score_kind == "labels"
-    best = loaded.labels(loaded.network(_images(16, 24)).argmax(dim=1))
+    best = ClassesHead(loaded.class_names).labels_of(loaded.network(_images(16, 24)).argmax(dim=1))
     expected = _linear(_images(16, 24)).argmax(axis=-1)
     np.testing.assert_array_equal(best, np.array([0, 1, 2, 3, 0])[expected])
 
@@ -101,7 +101,9 @@ def test_a_single_score_separates_two_classes(names: list[str], nodes: Any, tmp_
     k = names.index("sky")
     found = loaded.network(_images(16, 24)).softmax(dim=1)[:, k]
     np.testing.assert_allclose(found, expected, atol=1e-5)
-    labels = loaded.labels(loaded.network(_images(16, 24)).argmax(dim=1))
+    labels = ClassesHead(loaded.class_names).labels_of(
+        loaded.network(_images(16, 24)).argmax(dim=1)
+    )
     np.testing.assert_array_equal(labels == k + 1, expected > 0.5)
 
 
@@ -118,7 +120,7 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
     for network in (loaded, map_classes(loaded, merged).loaded):
         predictor = Predictor(network, head_of(network, min_confidence=0.5), ViewSelector(network))
         mosaic = predictor.predict(InputImage(rgb))
-        assert set(np.unique(network.labels(mosaic.labels()))) == {18}
+        assert set(np.unique(mosaic.pixels())) == {18}
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from tangent_train.geometry import (
+    CubeGrid,
     PinholeGrid,
     RingGrid,
     TangentGrid,
@@ -116,6 +117,22 @@ def test_classes_of_minus_infinity_have_no_probability(blend: Blend, backend: An
     assert (_labels(result) == 1).all()
 
 
+@pytest.mark.parametrize("averaged", [False, True])
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_a_score_of_minus_infinity_never_wins_and_does_not_spoil_others(
+    backend: Any, averaged: bool
+) -> None:
+    """At borders of cube faces, an infinite score has a weight of 0."""
+    grid, shape = CubeGrid(16), (64, 128)
+    scores = _scores(grid)
+    scores[torch.rand(scores.shape, generator=torch.Generator().manual_seed(0)) < 0.3] = -torch.inf
+    scores[:, 6] = -9
+    expected = tangent_to_equirect(scores.double().clamp(min=-1e30), grid, shape).argmax(dim=0)
+    result = ScoreMosaic(shape, 7, "nearest", averaged=averaged, backend=backend)
+    np.testing.assert_array_equal(_labels(_added(result, scores, grid)), expected)
+    assert result.not_finite == 0
+
+
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
 @pytest.mark.parametrize("averaged", [False, True])
 @pytest.mark.parametrize("backend", ["numba", "torch"])
@@ -135,7 +152,7 @@ def test_scores_that_are_not_finite_make_all_pixels_unknown_that_depend_on_them(
     _added(result, scores.double(), grid)  # networks may compute in float64
     labels = _labels(result)
     np.testing.assert_array_equal(labels, np.where(spoiled, 7, expected))
-    assert result.not_finite == pytest.approx(spoiled.mean())
+    assert float(result.not_finite) == pytest.approx(spoiled.mean())
     if averaged or blend == "feather":
         assert (_probabilities(result).sum(axis=-1) > 0.99).tolist() == (~spoiled).tolist()
     given = scores.softmax(1) if blend == "feather" else scores

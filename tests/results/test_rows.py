@@ -8,7 +8,7 @@ import pytest
 
 from tangent_train.errors import DataError
 from tangent_train.results.evaluation import EvaluationResult
-from tangent_train.results.rows import RunRow, Statistic, check_alike, group_results
+from tangent_train.results.rows import RunRow, check_alike, group_results
 from tests.results.example_results import example_result, without_solid_angle
 
 
@@ -40,12 +40,6 @@ def test_seeds_are_averaged_within_folds_and_then_the_folds(
     # Squares within folds: 0.04 + 0.01 + 0.09 and 0.01 + 0.01, over 2 + 1 degrees of freedom.
     assert wall.over_seeds == pytest.approx((0.16 / 3) ** 0.5)
     assert wall.folds == 3
-
-
-def test_a_class_absent_from_a_fold_is_left_out_there(three_folds: list[EvaluationResult]) -> None:
-    row = RunRow.of("", three_folds, {})
-    assert row.score("accuracy", "sofa")[:4] == pytest.approx((0.6, 0.02**0.5, 0, 2))
-    assert row.score("iou", "sofa", 3) == Statistic(None, None, None, 0)
 
 
 @pytest.mark.parametrize("name", ["miou", "miou_solid_angle"])

@@ -158,19 +158,6 @@ def test_a_plateau_is_stepped_after_every_nth_epoch(tmp_path: Path) -> None:
     assert rates[::STEPS] == pytest.approx([LR, LR, LR, LR, LR / 2, LR / 2])
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"interval": "epochs"}, "scheduler.interval: found 'epochs'; expected 'epoch' or 'step'"),
-        ({"frequency": 0}, "scheduler.frequency: found 0; expected an integer of 1 or more"),
-        ({"frequency": 1.5}, "scheduler.frequency: found 1.5; expected an integer"),
-    ],
-)
-def test_a_wrong_timing_is_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        Schedule(partial(lr_scheduler.StepLR, step_size=1), **settings)
-
-
 def test_a_plateau_of_an_unknown_score_is_refused(tmp_path: Path) -> None:
     scheduler = Schedule(partial(lr_scheduler.ReduceLROnPlateau, mode="min"), monitor="val/none")
     with pytest.raises(SettingError, match=r"scheduler\.monitor: found val/none; expected one of "):

@@ -37,12 +37,13 @@ from tangent_train.geometry.icosphere import (
     nearest_vertices,
     sampling_points,
 )
-from tangent_train.rendering.forward import Blend, check_panorama, sample_tensor
+from tangent_train.rendering.forward import Blend, check_panorama
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity, vertical_rotations
 from tangent_train.rendering.representations.views import RotationAugmentation, Views
 from tangent_train.rendering.resampling import Interpolation, Pixels, resize
 from tangent_train.rendering.tables import Value, cached
+from tangent_train.rendering.tensors import sample_tensor
 
 ScoreInterpolation = Literal["barycentric", "nearest"]
 

@@ -46,7 +46,7 @@ class Views:
 
     is_overlapping: bool
     chosen: NDArray[np.int64]
-    num_images: int
+    num_images: int = 1
     key: Hashable
     is_rotated: bool = False
 

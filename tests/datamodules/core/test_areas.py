@@ -97,26 +97,12 @@ def test_the_area_rotates_with_the_panorama(
     np.testing.assert_array_equal(panorama.valid, panorama.labels > 0)
 
 
-def test_a_cache_holds_the_pixels_of_the_area_and_memory_the_same_panoramas(
-    tmp_path: Path,
-) -> None:
-    root = write_strips(tmp_path / "data", (100, 512))
-    settings: Any = {"area": AREA, "fill": "reflect", "test_rotation": 20}
-    erp = EquirectRepresentation(7)
-    plain, cached, kept = (
-        FolderPanoramas(root, erp, **settings, **how)
-        for how in ({}, {"cache": tmp_path / "cache"}, {"in_memory": True})
-    )
-    cached.prepare_data()
-    file = next((tmp_path / "cache").rglob("*.npy"))
+def test_a_cache_holds_the_pixels_of_the_area(tmp_path: Path) -> None:
+    root, cache = write_strips(tmp_path / "data", (100, 512)), tmp_path / "cache"
+    FolderPanoramas(root, EquirectRepresentation(7), area=AREA, cache=cache).prepare_data()
+    file = next(cache.rglob("*.npy"))
     assert np.load(file)["rgb"].shape == (100, 512, 3)
     assert file.stat().st_size < 1.05 * 100 * 512 * 4
-    for split in ("train", "test"):
-        expected = plain.dataset(split).read(0)
-        for data in (cached, kept):
-            found = data.dataset(split).read(0)
-            for name in ("rgb", "labels", "valid"):
-                np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 @pytest.mark.parametrize("rotation", [None, "so3"])

@@ -15,7 +15,7 @@ from lightning.pytorch.plugins import HalfPrecision
 from lightning.pytorch.trainer.states import TrainerFn
 from numpy.typing import NDArray
 
-from datamodules.core.dataset import Image, sample_rng
+from datamodules.core.dataset import Image
 from datamodules.core.files import SPLITS, ImageFiles
 from datamodules.core.label_map import class_weights
 from datamodules.core.loading import EpochSampler
@@ -238,13 +238,6 @@ def test_weights_without_labels_or_weighting() -> None:
 
 def _indices(sampler: EpochSampler) -> list[int]:
     return [index for _, index in sampler]
-
-
-def test_every_sample_and_epoch_has_its_own_randomness() -> None:
-    keys = [(s, e, i) for s in range(3) for e in range(3) for i in range(3)]
-    draws = {sample_rng(*key).random() for key in keys}
-    assert len(draws) == len(keys)
-    assert sample_rng(1, 2, 3).random() == sample_rng(1, 2, 3).random()
 
 
 def test_shuffled_order_is_new_every_epoch_and_reproducible() -> None:

@@ -13,14 +13,14 @@ import torch
 from numpy.typing import NDArray
 
 from datamodules.cityscapes import Cityscapes
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule, draw_rotation
+from datamodules.core.dataset import draw_rotation
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.folder.labeled import FolderPanoramas
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
 from datamodules.synthia.omnisynthia import SynthiaPerspective
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
-from tangent_train.io.pixel_files import write_depth_m
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.conftest import fabricate
 from tests.datamodules.data_files import read_png, write_png
@@ -141,22 +141,6 @@ def _pixels(
     columns = np.floor((np.arctan2(y, x) / np.pi + 1) * height).astype(int) % (2 * height)
     rows = np.floor((0.5 - np.arcsin(np.clip(z, -1, 1)) / np.pi) * height).astype(int)
     return np.clip(rows, 0, height - 1), columns
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".exr"])
-def test_float_depth_of_a_folder_is_in_meters(tmp_path: Path, suffix: str) -> None:
-    """Other programs write RGB-D pairs like these."""
-    meters = np.random.default_rng(0).uniform(0.01, 9, (32, 64)).astype(np.float32)
-    special = [np.nan, np.inf, -1, 0, 1e-4, 127.99, 128, 5000, 1e10]
-    meters[0, : len(special)] = special
-    for name in "abc":
-        save(tmp_path / "images" / f"{name}.png", np.zeros((32, 64, 3), np.uint8))
-        write_depth_m(tmp_path / "depth" / f"{name}{suffix}", meters, 1)
-    representation: Any = EquirectRepresentation(4)
-    data = _data(SOURCES["folder"], tmp_path, representation, val_fraction=0)
-    labels = data.dataset("test")[0].labels.numpy()
-    assert labels[0, : len(special)].tolist() == [0, 0, 0, 0, 1, 65531, 0, 0, 0]
-    np.testing.assert_allclose(labels[1:] / 512, meters[1:], atol=0.5001 / 512)
 
 
 def test_a_channel_of_depth_can_be_named(tmp_path: Path) -> None:

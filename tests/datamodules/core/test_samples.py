@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from datamodules.core.dataset import Image, ImageDataset, jitter_colors, render_inputs, world_rays
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, normalize
 from tangent_train.geometry import equirect_directions
-from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
+from tangent_train.rendering import (
+    CubemapRepresentation,
+    EquirectRepresentation,
+    HorizontalRepresentation,
+    TangentRepresentation,
+)
 from tangent_train.rendering.representations.views import Representation
 
 DEPTH: tuple[Input, ...] = ("rgb", "depth")
@@ -127,6 +132,49 @@ def test_views_are_those_of_seed_epoch_and_index(erp: Representation) -> None:
     assert torch.equal(first, _training(erp)[4, 1].labels)
     assert not torch.equal(first, _training(erp)[5, 1].labels)
     assert not torch.equal(first, _training(erp, seed=1)[4, 1].labels)
+
+
+def _cells(image: NDArray[Any], rays: torch.Tensor, dim: int, parts: int) -> NDArray[np.float64]:
+    """Nearest pixels at parts × parts positions in each pixel of views, in float64."""
+    places = (2 * np.arange(parts * dim) + 1) / (parts * dim) - 1
+    plane = np.stack([*np.meshgrid(places, places), np.ones((parts * dim,) * 2)], -1)
+    x, y, z = np.einsum("nij,hwj->inhw", rays.double().numpy(), plane)
+    height, width = image.shape[:2]
+    column = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * width).astype(int) % width
+    row = np.floor((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height).astype(int)
+    cells = image[row.clip(0, height - 1), column].astype(np.float64)
+    return cells.reshape(len(rays), dim, parts, dim, parts, *image.shape[2:])
+
+
+@pytest.mark.parametrize(
+    "representation",
+    [
+        CubemapRepresentation(4, dim=16, random_rotation="so3", mirror=True),
+        TangentRepresentation(0, 4, random_rotation="so3", faces_per_panorama=8, mirror=True),
+        HorizontalRepresentation(4, [{"pitch": 0, "views": 6}], 130, 24, blend="nearest",
+                                 area=(-180, 180, -40, 40), random_rotation="yaw"),
+    ],
+)  # fmt: skip
+def test_views_much_coarser_than_the_panorama_average_colors_and_copy_labels_and_depth(
+    representation: Representation,
+) -> None:
+    """White noise: means have a small deviation, and copied pixels are those of the panorama."""
+    rng, shape = np.random.default_rng(0), (256, 512)
+    rgb = (rng.integers(0, 2, (*shape, 3)) * 255).astype(np.uint8)
+    depth = rng.integers(1, 2000, shape).astype(np.uint16)
+    image = Image(rgb, depth, rng.integers(0, 256, shape).astype(np.uint8))
+    data = _training(representation)
+    data.read = lambda index: image  # type: ignore[method-assign]
+    for epoch in range(3):
+        sample = data[epoch, 0]
+        colors, steps = sample.images
+        dim = colors.shape[1]
+        means = _cells(rgb, sample.rays, dim, 25).mean(axis=(2, 4))
+        assert colors.double().std() < 1.1 * means.std()
+        assert ((colors.numpy() - means) ** 2).mean() < means.var()  # not reduced: 9 times as much
+        for found, whole in ((steps, depth), (sample.labels, image.labels)):
+            exact = _cells(whole, sample.rays, dim, 1)[:, :, 0, :, 0]
+            assert (found.numpy() == exact).mean() > 0.995  # others are at edges of pixels
 
 
 # --- colors -----------------------------------------------------------------------------------

@@ -1,0 +1,171 @@
+"""Panoramas as tensors: sampled and resized by torch on any device, differentiably.
+
+A panorama is *framed* by one more row and column on each side, so that positions beyond its edges
+are sampled like all others: longitude wraps, and a row beyond a pole is the row at the pole,
+shifted by half a revolution.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch.nn.functional import embedding_bag, grid_sample
+
+from tangent_train.rendering.tables import cached_of, map_dtype, positions_of_pixels
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from tangent_train.geometry import PinholeGrid
+    from tangent_train.rendering.resampling import Interpolation
+
+
+def on_device(array: NDArray[Any], device: torch.device) -> Tensor:
+    """Copy an array to a device; a GPU is not waited for."""
+    tensor = torch.from_numpy(np.ascontiguousarray(array))
+    pinned = tensor.pin_memory() if device.type == "cuda" else tensor
+    return pinned.to(device, non_blocking=True)
+
+
+def render_tensor(
+    image: Tensor, grid: PinholeGrid, faces: NDArray[np.int64], interpolation: Interpolation
+) -> Tensor:
+    """Render images ``(..., n, C, h, w)`` of a panorama ``(..., C, H, W)``.
+
+    Args:
+        image: The panorama, floating-point for ``bilinear``.
+        grid: Geometry of the images.
+        faces: ``(n,)`` indices of the images.
+        interpolation: ``bilinear`` or ``nearest``.
+    """
+    positions = _positions(grid, image, faces, interpolation)
+    planes = image.flatten(0, -3)
+    if interpolation == "nearest":
+        values = planes.flatten(-2).index_select(-1, positions.flatten())
+        images = values.unflatten(-1, positions.shape).movedim(0, 1)
+    else:
+        images = _sampled(planes, positions)
+    return images.unflatten(1, image.shape[:-2]).movedim(0, -4)
+
+
+def _positions(
+    grid: PinholeGrid, image: Tensor, faces: NDArray[np.int64], interpolation: Interpolation
+) -> Tensor:
+    """Return positions of the pixels of images, on the device of the panorama.
+
+    The table of all images is kept; of rotated images, which change from sample to sample, that of
+    the requested ones.
+
+    Returns:
+        ``(n, h, w, 2)`` positions for `_sampled`; or ``(n, h, w)`` flat int32 indices for
+        ``nearest``.
+    """
+    shape, device = (image.shape[-2], image.shape[-1]), image.device
+    dtype = map_dtype(image.dtype == torch.float64, interpolation)
+    every = grid.face_indices()
+    kept = every if grid.rotation is None else faces
+
+    def build() -> tuple[Tensor]:
+        columns, rows = positions_of_pixels(grid, shape, kept, dtype)
+        u, v = (on_device(line.reshape(-1, *grid.size), device) for line in (columns, rows))
+        if interpolation == "nearest":
+            return (nearest_equirect_index(u, v, shape).int(),)
+        return (_in_frame(u, v, shape),)
+
+    key = "positions", device, shape, dtype, interpolation, tuple(kept.tolist())
+    table = cached_of(grid, key, build, device)[0]
+    if np.array_equal(kept, faces):
+        return table
+    return table.index_select(0, on_device(faces, device))
+
+
+def sample_tensor(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Interpolate a panorama bilinearly, differentiably on any device.
+
+    Args:
+        image: ``(C, H, W)`` floating-point values.
+        u: ``(P,)`` columns in [−1, 2 W].
+        v: ``(P,)`` rows in [−½, H − ½].
+
+    Returns:
+        ``(C, P)`` values of the dtype of the image.
+    """
+    shape = image.shape[-2], image.shape[-1]
+    positions = _in_frame(u.where(u < shape[1], u - shape[1]), v, shape)
+    return _sampled(image, positions[None, None])[0, :, 0]
+
+
+def _in_frame(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return positions ``(..., 2)`` in a framed panorama, −1 to 1 between its edges."""
+    x, y = ((2 * at + 3) / (side + 2) - 1 for at, side in ((u, shape[1]), (v, shape[0])))
+    return torch.stack([x, y], dim=-1)
+
+
+def _sampled(image: Tensor, positions: Tensor) -> Tensor:
+    """Return bilinear values ``(n, C, h, w)`` of a panorama at positions ``(n, h, w, 2)``."""
+    framed = _framed(image if image.dtype == torch.float64 else image.float())[None]
+    count, given = len(positions), positions.to(framed.dtype)
+    if framed.requires_grad:  # the gradient of an expanded tensor takes n times its memory
+        given = given.flatten(0, 1)[None]
+    else:
+        framed = framed.expand(count, -1, -1, -1)
+    with torch.autocast(image.device.type, enabled=False):
+        values = grid_sample(framed, given, padding_mode="border", align_corners=False)
+    if len(values) != count:
+        values = values[0].unflatten(1, (count, -1)).movedim(1, 0)
+    return values.to(image.dtype)
+
+
+def _framed(image: Tensor) -> Tensor:
+    """Return a panorama ``(C, H, W)`` with its frame, ``(C, H + 2, W + 2)``."""
+    above, below = (_half_revolution(image[:, row]) for row in (slice(1), slice(-1, None)))
+    tall = torch.cat([above, image, below], dim=1)
+    return torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=2)
+
+
+def _half_revolution(row: Tensor) -> Tensor:
+    """Return a row ``(C, 1, W)`` rotated by 180°; means of two columns if W is odd."""
+    width = row.shape[-1]
+    rotated = row.roll(width // 2, -1)
+    return (rotated + row.roll(width // 2 + 1, -1)) / 2 if width % 2 else rotated
+
+
+def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return the nearest pixel at positions in an ERP; half-way between two, the even one.
+
+    Args:
+        u: Columns, any real number.
+        v: Rows in [−½, H − ½], of the same shape.
+        shape: ``(H, W)``.
+
+    Returns:
+        Flat indices, int64.
+    """
+    height, width = shape
+    row = v.round().long().clamp(0, height - 1)
+    return row * width + u.round().long() % width
+
+
+def weigh_rows(image: Tensor, first: NDArray[np.int64], weights: NDArray[np.float64]) -> Tensor:
+    """Return weighted sums of rows of an image.
+
+    Args:
+        image: ``(..., H, W)``.
+        first: ``(h,)`` first row of each sum.
+        weights: ``(taps, h)`` weights of this row and those below.
+
+    Returns:
+        ``(..., h, W)`` of the dtype of the image, float64 or float32.
+    """
+    rows = image.movedim(-2, 0)
+    taps = (first + np.arange(len(weights))[:, None]).T.clip(0, len(rows) - 1)
+    sums = embedding_bag(
+        on_device(taps, image.device),
+        rows.flatten(1),
+        mode="sum",
+        per_sample_weights=on_device(weights.T, image.device).to(image.dtype),
+    )
+    return sums.unflatten(1, rows.shape[1:]).movedim(0, -2)
