@@ -444,7 +444,7 @@ class DataModule(LightningDataModule, ABC):
                 counts += np.bincount(labels.ravel(), minlength=len(counts))
             for doubt in label_doubts("train", counts, self.class_names):
                 print_on_rank_zero(f"Warning: {doubt}")
-        return class_weights(counts[1:], kind)
+        return torch.from_numpy(class_weights(counts[1:], kind))
 
     # --- loaders -------------------------------------------------------------------------------
 

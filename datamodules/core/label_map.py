@@ -14,9 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tangent_train.errors import DataError, counted
 from tangent_train.files import read_json
@@ -233,7 +231,7 @@ def plain_name(name: str) -> str:
     return " ".join(first.casefold().split())
 
 
-def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
+def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> NDArray[np.float32]:
     """Return the weights of the classes in the loss.
 
     With r the share of a class among the labeled pixels: `log` is ``1 / ln(1.02 + r)``
@@ -247,7 +245,7 @@ def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
         ``(K,)`` float32; 0 for classes without pixels, except with `none`.
     """
     if kind == "none":
-        return torch.ones(len(counts))
+        return np.ones(len(counts), np.float32)
     seen = counts > 0
     shares = counts[seen] / counts.sum()
     of_seen = 1 / (np.log(_LOG_OFFSET + shares) if kind == "log" else np.sqrt(shares))
@@ -255,7 +253,7 @@ def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
         of_seen /= of_seen.mean()
     weights = np.zeros(len(counts), np.float32)
     weights[seen] = of_seen
-    return torch.from_numpy(weights)
+    return weights
 
 
 def label_doubts(split: str, counts: NDArray[np.int64], class_names: Sequence[str]) -> list[str]:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps, resize_depth
 from datamodules.core.label_map import PIXEL_CLASSES
@@ -21,10 +20,12 @@ from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from tangent_train.io.videos import Frame
 from tangent_train.orientation.gravity import estimate_up
-from tangent_train.rendering.resampling import resize
+from tangent_train.rendering.resampling import is_tensor, resize
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+    from torch import Tensor
 
     from tangent_train.inference.engine import UpLikelihood
     from tangent_train.io.gpano import Eye
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16]]
     """Returns depth of an image of a size, in steps of 1/512 m."""
 
-Picture = str | Path | Image.Image | NDArray[Any] | Tensor
+Picture: TypeAlias = "str | Path | Image.Image | NDArray[Any] | Tensor"
 """A file; a Pillow image; or RGB from 0 to 255, an array ``(H, W, 3)`` or tensor ``(3, H, W)`` of
 uint8 on any device."""
 
@@ -217,8 +218,8 @@ def _read(image: Any) -> tuple[NDArray[np.uint8], Path | None]:
         return image(), None
     if isinstance(image, Image.Image):
         return read_rgb(image), None
-    array = image.numpy(force=True) if isinstance(image, Tensor) else np.asarray(image)
-    if isinstance(image, Tensor) and array.ndim == 3:
+    array = image.numpy(force=True) if is_tensor(image) else np.asarray(image)
+    if is_tensor(image) and array.ndim == 3:
         array = np.moveaxis(array, 0, -1)
     if array.dtype == np.uint8 and array.shape[2:] == (3,):
         return np.ascontiguousarray(array), None

@@ -13,13 +13,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from tangent_train import rendering
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.io import pixel_files
 from tangent_train.io.camera_files import CameraFile, View
 from tangent_train.io.gpano import Eye, PanoramaArea, eye_part, read_area, read_tags
 from tangent_train.io.videos import Frame
-from tangent_train.rendering import Blend, Interpolation, equirect_to_tangent, tangent_to_equirect
+from tangent_train.rendering import Blend, Interpolation, equirect_to_tangent
 from tangent_train.rendering.resampling import reduce_to_pitch
 from tangent_train.threads import in_threads
 
@@ -265,14 +266,16 @@ class TangentResults:
         grid = self.grid
         shape = (out.shape[0], out.shape[1])
         if self.kind in ("labels", "depth"):
-            out[:] = tangent_to_equirect(np.stack(arrays), grid, shape, interpolation="nearest")
+            out[:] = rendering.tangent_to_equirect(
+                np.stack(arrays), grid, shape, interpolation="nearest"
+            )
             return
         channels = out.shape[2:]
         step = max(1, _GROUP_BYTES // (4 * grid.num_images * math.prod(grid.size)))
         for start in range(0, channels[0], step) if channels else (0,):
             part = (..., slice(start, start + step)) if channels else ...
             group = np.stack([array[part] for array in arrays])
-            out[part] = tangent_to_equirect(group, grid, shape, blend)
+            out[part] = rendering.tangent_to_equirect(group, grid, shape, blend)
 
 
 def _kind_of(file: Path, array: NDArray[Any]) -> ResultKind:

@@ -13,7 +13,6 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
@@ -27,6 +26,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.geometry.sphere import Floats
 from tangent_train.rendering import equirect_to_tangent
+from tangent_train.rendering.kernels import num_threads
 from tangent_train.rendering.resampling import reduce_to_pitch
 
 _cv2: Any = cv2  # its types lack the detectors
@@ -141,7 +141,7 @@ def detect_on_tangent_images(
         _, keypoints = _detect(equirect_to_tangent(gray, wide, [face])[0], directions, face)
         return keypoints.select(wide.owners(keypoints.directions_xyz) == face)
 
-    threads = min(torch.get_num_threads(), max(1, _PIXELS_AT_ONCE // math.prod(wide.size)))
+    threads = min(num_threads(), max(1, _PIXELS_AT_ONCE // math.prod(wide.size)))
     with ThreadPoolExecutor(threads) as pool:
         parts = list(pool.map(search, range(wide.num_images)))
     columns = ([getattr(part, field.name) for part in parts] for field in fields(parts[0]))

@@ -4,10 +4,10 @@ NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on 
 by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from tangent_train.rendering.forward import Blend, equirect_to_tangent, perspective, rotate_equirect
-from tangent_train.rendering.mosaic import tangent_to_equirect, tangent_to_labels
-from tangent_train.rendering.representations.equirect import EquirectRepresentation
-from tangent_train.rendering.representations.icosphere import IcosphereRepresentation
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 from tangent_train.rendering.representations.pinhole import (
     CubemapRepresentation,
@@ -17,6 +17,11 @@ from tangent_train.rendering.representations.pinhole import (
 from tangent_train.rendering.representations.views import Representation
 from tangent_train.rendering.resampling import Interpolation
 from tangent_train.rendering.tables import set_table_cache_limit
+
+if TYPE_CHECKING:
+    from tangent_train.rendering.mosaic import tangent_to_equirect, tangent_to_labels
+    from tangent_train.rendering.representations.equirect import EquirectRepresentation
+    from tangent_train.rendering.representations.icosphere import IcosphereRepresentation
 
 __all__ = [
     "Blend",
@@ -35,3 +40,17 @@ __all__ = [
     "tangent_to_equirect",
     "tangent_to_labels",
 ]
+
+_WITH_TORCH = {
+    "EquirectRepresentation": "representations.equirect",
+    "IcosphereRepresentation": "representations.icosphere",
+    "tangent_to_equirect": "mosaic",
+    "tangent_to_labels": "mosaic",
+}
+"""Modules that import torch, which takes seconds, when one of their names is used."""
+
+
+def __getattr__(name: str) -> Any:
+    if name in _WITH_TORCH:
+        return getattr(import_module(f"{__name__}.{_WITH_TORCH[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -7,18 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from tangent_train.errors import SettingError, check_choice, check_type
 from tangent_train.geometry import Angles, PinholeGrid, checked_rotation, perspective_grid
 from tangent_train.geometry.grids import Faces
-from tangent_train.rendering.resampling import Interpolation, Pixels, reduce_to_pitch
+from tangent_train.rendering.resampling import Interpolation, Pixels, is_tensor, reduce_to_pitch
 from tangent_train.rendering.tables import (
     EquirectMap,
     forward_map,
@@ -26,13 +24,9 @@ from tangent_train.rendering.tables import (
     positions_of_rays,
     sphere_rays,
 )
-from tangent_train.rendering.tensors import (
-    nearest_equirect_index,
-    on_device,
-    render_tensor,
-    sample_tensor,
-)
-from tangent_train.rendering.traced import is_traced, traceable, traced
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Blend = Literal["nearest", "feather"]
 """``nearest``: each pixel is taken from the image that owns it. ``feather``: the average of all
@@ -49,7 +43,6 @@ _COPIED = 36
 """Largest part of a panorama that is copied, in bytes per position: copying more takes longer."""
 
 
-@traceable
 def equirect_to_tangent(
     image: Pixels,
     grid: PinholeGrid,
@@ -77,14 +70,19 @@ def equirect_to_tangent(
     Raises:
         SettingError: The panorama, a face or the interpolation cannot be used.
     """
-    if is_traced(image):
-        return traced("equirect_to_tangent", image, grid, faces, interpolation)
+    if is_tensor(image):
+        from tangent_train.rendering.traced import is_traced, traced
+
+        if is_traced():
+            return traced("equirect_to_tangent", image, grid, faces, interpolation)
     check_panorama(image, interpolation)
     check_grid(grid)
     if interpolation == "bilinear":
         image = reduce_to_pitch(image, grid.pitch)
     indices, (rows, columns) = grid.face_indices(faces), grid.size
-    if isinstance(image, Tensor):
+    if is_tensor(image):
+        from tangent_train.rendering.tensors import render_tensor
+
         return render_tensor(image, grid, indices, interpolation)
     # For random subsets of images, tables are cached per image: subsets rarely repeat.
     is_together = faces is None or grid.rotation is not None
@@ -134,7 +132,7 @@ def perspective(
     grid = perspective_grid(yaw, pitch, fov, size, roll).with_rotation(np.eye(3))
     images: Any = equirect_to_tangent(image, grid, None, interpolation)
     if max(map(np.ndim, (yaw, pitch, roll))) == 0:
-        images = images.squeeze(-4) if isinstance(image, Tensor) else images[0]
+        images = images.squeeze(-4) if is_tensor(image) else images[0]
     return images
 
 
@@ -157,15 +155,13 @@ def rotate_equirect(
     """
     check_panorama(image, interpolation)
     rotated = checked_rotation(rotation).tobytes()
-    is_exact = image.dtype in (torch.float64, np.float64)
-    height, width = image.shape[-2:] if isinstance(image, Tensor) else image.shape[:2]
+    is_exact = str(image.dtype).endswith("float64")
+    height, width = image.shape[-2:] if is_tensor(image) else image.shape[:2]
     table = _rotation_map(rotated, (height, width), map_dtype(is_exact, interpolation))
-    if isinstance(image, Tensor):
-        u, v = (on_device(line.ravel(), image.device) for line in table[:2])
-        if interpolation == "nearest":
-            index = nearest_equirect_index(u, v, (height, width))
-            return image.flatten(-2).index_select(-1, index).reshape(image.shape)
-        return sample_tensor(image.flatten(0, -3), u, v).reshape(image.shape)
+    if is_tensor(image):
+        from tangent_train.rendering.tensors import sample_positions
+
+        return sample_positions(image, table.u, table.v, interpolation)
     out = np.empty_like(image, order="C")
     sample_map(table, np.ascontiguousarray(image), interpolation, out)
     return out
@@ -257,12 +253,23 @@ def _write_polar(table: EquirectMap, image: NDArray[np.generic], out: NDArray[np
 
 def _interpolated(image: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.float64]:
     """Return float64 values ``(…[, C])`` of a whole or partial panorama ``(H, W[, C])``."""
-    shape = image.shape[:2]
-    planes = np.moveaxis(image.reshape(*shape, -1), -1, 0).astype(np.float64)
-    columns, rows = (torch.from_numpy(line.reshape(-1)).double() for line in (u, v))
-    values = sample_tensor(torch.from_numpy(planes), columns, rows).numpy().T
-    values = np.rint(values) if image.dtype.kind in "ui" else values
-    return values.reshape(*u.shape, *image.shape[2:])
+    pixels = image.astype(np.float64)
+    width = image.shape[1]
+    beyond = [
+        (np.roll(row, width // 2, 1) + np.roll(row, -(-width // 2), 1)) / 2
+        for row in (pixels[:1], pixels[-1:])
+    ]
+    tall = np.concatenate([beyond[0], pixels, beyond[1]])
+    framed = np.concatenate([tall[:, -1:], tall, tall[:, :1]], axis=1)
+    x, y = np.where(u < width, u, u - width) + 1.0, v + 1.0
+    column, row = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
+    more = [1] * (image.ndim - 2)
+    right, below = (share.reshape(*u.shape, *more) for share in (x - column, y - row))
+    column, row = column.clip(0, width), row.clip(0, len(image))
+    upper = framed[row, column] * (1 - right) + framed[row, column + 1] * right
+    lower = framed[row + 1, column] * (1 - right) + framed[row + 1, column + 1] * right
+    values: NDArray[np.float64] = upper * (1 - below) + lower * below
+    return np.rint(values) if image.dtype.kind in "ui" else values
 
 
 def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
@@ -305,7 +312,8 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
 
 def check_array(name: str, images: object) -> None:
     """Raise TypeError unless images are an array or a tensor."""
-    check_type(name, images, (np.ndarray, Tensor), "a NumPy array or a torch tensor")
+    if not is_tensor(images):
+        check_type(name, images, np.ndarray, "a NumPy array or a torch tensor")
 
 
 def check_grid(grid: object) -> None:
@@ -356,8 +364,8 @@ def check_images(
 
 
 def _check_numbers(name: str, values: Tensor | NDArray[np.generic], interpolation: str) -> None:
-    if isinstance(values, Tensor):
-        usable = interpolation == "nearest" or torch.is_floating_point(values)
+    if is_tensor(values):
+        usable = interpolation == "nearest" or values.is_floating_point()
     else:
         usable = values.dtype.kind in ("uif" if interpolation == "bilinear" else "buif")
     if not usable:

@@ -20,6 +20,8 @@ to a multiple of `LANES`, so that loops over them compile to vector code without
 from __future__ import annotations
 
 import math
+import os
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -27,7 +29,6 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numba import njit
 from numba.core.compiler import Compiler
 from numpy.typing import NDArray
@@ -95,7 +96,7 @@ def over_rows(kernel: Callable[..., None], rows: int, width: int, *arguments: An
         width: Pixels in a row.
         *arguments: Other arguments of the kernel.
     """
-    threads = min(torch.get_num_threads(), rows, rows * width // _SMALLEST_SHARE)
+    threads = min(num_threads(), rows, rows * width // _SMALLEST_SHARE)
     if threads <= 1:
         kernel(0, rows, *arguments)
         return
@@ -106,6 +107,13 @@ def over_rows(kernel: Callable[..., None], rows: int, width: int, *arguments: An
         runs = [pool.submit(kernel, start, stop, *arguments) for start, stop in pairwise(edges)]
         for run in runs:
             run.result()
+
+
+def num_threads() -> int:
+    """Return the number of threads of torch; before torch is imported, its default."""
+    if "torch" in sys.modules:
+        return int(sys.modules["torch"].get_num_threads())
+    return int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
 
 
 class CanvasGeometry(NamedTuple):

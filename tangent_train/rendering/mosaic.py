@@ -28,10 +28,10 @@ from tangent_train.rendering.forward import (
 )
 from tangent_train.rendering.numba_sums import NO_SUMS, NumbaSums
 from tangent_train.rendering.representations.views import PinholeViews
-from tangent_train.rendering.resampling import Interpolation, Pixels
+from tangent_train.rendering.resampling import Interpolation, Pixels, is_tensor
 from tangent_train.rendering.tables import nearest_pixels
 from tangent_train.rendering.torch_sums import TorchSums, fits_on
-from tangent_train.rendering.traced import is_traced, traceable, traced
+from tangent_train.rendering.traced import is_traced, traced
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -246,7 +246,6 @@ def blend_back(grid: PinholeGrid, blend: Blend) -> Blend:
     return blend
 
 
-@traceable
 def tangent_to_equirect(
     images: Pixels,
     grid: PinholeGrid,
@@ -274,7 +273,7 @@ def tangent_to_equirect(
         SettingError: The images, the shape, the blend or the interpolation cannot be used, or the
             images do not cover the sphere.
     """
-    if is_traced(images):
+    if is_tensor(images) and is_traced():
         return traced("tangent_to_equirect", images, grid, shape, blend, interpolation)
     check_array("tangent images", images)
     check_grid(grid)
@@ -295,7 +294,6 @@ def tangent_to_equirect(
     return result.reshape(*images.shape[:-4], images.shape[-3], *shape)
 
 
-@traceable
 def tangent_to_labels(
     logits: Pixels, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
 ) -> Pixels:
@@ -320,7 +318,7 @@ def tangent_to_labels(
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
     """
-    if is_traced(logits):
+    if is_tensor(logits) and is_traced():
         return traced("tangent_to_labels", logits, grid, shape, blend)
     check_array("scores", logits)
     check_grid(grid)

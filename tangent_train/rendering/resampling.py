@@ -7,20 +7,21 @@ same filters, first the rows and then the columns.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, TypeVar
+import sys
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
-from tangent_train.rendering.tensors import weigh_rows
+if TYPE_CHECKING:
+    from torch import Tensor
+    from typing_extensions import TypeIs
 
 Interpolation = Literal["bilinear", "nearest"]
 
-Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
+Pixels = TypeVar("Pixels", "Tensor", NDArray[Any])
 """A tensor or an array; results are of the same kind."""
 
 Box = NDArray[np.float64]
@@ -29,15 +30,17 @@ Box = NDArray[np.float64]
 _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
 """Types that OpenCV resizes without loss."""
 
-_TENSORS = (torch.float32, torch.float64)
-"""Types of tensors that OpenCV resizes, on the CPU if no gradient is needed."""
-
 _KEPT_PIXELS = 1.5
 """Pixels of a reduced panorama along the side of a pixel of a view: bilinear interpolation lowers
 the variance of noise as much as the mean of 1.5 × 1.5 pixels."""
 
 _MOST_PIXELS = 1.6
 """Most pixels of a panorama that is not reduced. At the level of the views there are 1.3 to 1.5."""
+
+
+def is_tensor(image: object) -> TypeIs[Tensor]:
+    """Return True for a tensor; torch, which takes seconds to import, is not imported for it."""
+    return "torch" in sys.modules and isinstance(image, sys.modules["torch"].Tensor)
 
 
 def resize(image: Pixels, shape: tuple[int, int], interpolation: Interpolation) -> Pixels:
@@ -49,7 +52,7 @@ def resize(image: Pixels, shape: tuple[int, int], interpolation: Interpolation) 
         interpolation: ``bilinear``, which averages areas along the sides that become smaller;
             ``nearest`` takes the pixel at the center of each pixel of the result.
     """
-    height, width = image.shape[-2:] if isinstance(image, Tensor) else image.shape[:2]
+    height, width = image.shape[-2:] if is_tensor(image) else image.shape[:2]
     if (height, width) == shape:
         return image
     if interpolation == "nearest":
@@ -58,12 +61,8 @@ def resize(image: Pixels, shape: tuple[int, int], interpolation: Interpolation) 
             for after, before in zip(shape, (height, width), strict=True)
         )
         return _pick(image, rows, columns)
-    if isinstance(image, Tensor):
-        is_plain = image.device.type == "cpu" and not image.requires_grad and image.numel() > 0
-        if not is_plain or image.dtype not in _TENSORS:
-            return _filtered(image, np.array((0.0, 0.0, width, height)), shape, "area")
-        planes = [_resized(plane.numpy(), shape) for plane in image.reshape(-1, height, width)]
-        return torch.from_numpy(np.stack(planes)).reshape(*image.shape[:-2], *shape)
+    if is_tensor(image):
+        return _filtered(image, np.array((0.0, 0.0, width, height)), shape, "area")
     exact = image if image.dtype in _RESIZABLE else image.astype(np.float64)
     whole = [exact]
     if exact.shape[2:] > (4,):  # OpenCV averages areas of four channels at most
@@ -99,7 +98,7 @@ def reduce_to_pitch(image: Pixels, pitch: float) -> Pixels:
         A panorama of which a pixel in the middle of an image covers 1.5 × 1.5 pixels, averaged over
         areas; the panorama itself if it has about as few pixels.
     """
-    sides = image.shape[-2:] if isinstance(image, Tensor) else image.shape[:2]
+    sides = image.shape[-2:] if is_tensor(image) else image.shape[:2]
     covered = [pitch * side / angle for side, angle in zip(sides, (math.pi, math.tau), strict=True)]
     rows, columns = (
         side if pixels <= _MOST_PIXELS else math.ceil(side * _KEPT_PIXELS / pixels)
@@ -125,7 +124,7 @@ def crop(image: Pixels, box: Box, shape: tuple[int, int], interpolation: Interpo
             for near, far, count in zip(box[:2], box[2:], shape[::-1], strict=True)
         )
         return _pick(image, rows, columns)
-    if isinstance(image, Tensor):
+    if is_tensor(image):
         return _filtered(image, box, shape, "triangle")
     corners = tuple(box.tolist())
     resized = Image.fromarray(image).resize(shape[::-1], Image.Resampling.BILINEAR, box=corners)
@@ -134,9 +133,11 @@ def crop(image: Pixels, box: Box, shape: tuple[int, int], interpolation: Interpo
 
 
 def _pick(image: Pixels, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Pixels:
-    if isinstance(image, np.ndarray):
+    if not is_tensor(image):
         return image[rows][:, columns]
-    down, across = (torch.from_numpy(index).to(image.device) for index in (rows, columns))
+    from tangent_train.rendering.tensors import on_device
+
+    down, across = (on_device(index, image.device) for index in (rows, columns))
     return image.index_select(-2, down).index_select(-1, across)
 
 
@@ -144,7 +145,9 @@ def _filtered(
     image: Tensor, box: Box, shape: tuple[int, int], kind: Literal["area", "triangle"]
 ) -> Tensor:
     """Resize a part of ``(..., H, W)``."""
-    result = image if image.dtype == torch.float64 else image.float()
+    from tangent_train.rendering.tensors import exact, weigh_rows
+
+    result = exact(image)
     for axis, (near, far) in ((0, box[1::2]), (1, box[::2])):
         before, after = result.shape[-2], shape[axis]
         if (before, near, far) != (after, 0, after):

@@ -13,16 +13,18 @@ from collections.abc import Callable, Hashable
 from functools import lru_cache
 from os import register_at_fork
 from threading import Lock
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid, equirect_latitudes, equirect_longitudes
 from tangent_train.rendering import kernels
 from tangent_train.rendering.kernels import Array, njit_exact, over_rows
+
+if TYPE_CHECKING:
+    import torch
 
 Value = TypeVar("Value", bound=tuple[Any, ...])
 Rays = tuple[Array, Array]
@@ -116,6 +118,8 @@ def set_table_cache_limit(nbytes: int) -> None:
 @lru_cache
 def _tables_on(device: torch.device) -> TableCache:
     """Return the cache of tables on a device other than the CPU."""
+    import torch
+
     if device.type == "cuda" and torch.cuda.is_available():
         return TableCache(torch.cuda.get_device_properties(device).total_memory // _DEVICE_SHARE)
     return TableCache(TABLES.limit)

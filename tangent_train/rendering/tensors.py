@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from tangent_train.rendering.resampling import Interpolation
 
 
+def exact(image: Tensor) -> Tensor:
+    """Return an image as float64 if it is, else as float32."""
+    return image if image.dtype == torch.float64 else image.float()
+
+
 def on_device(array: NDArray[Any], device: torch.device) -> Tensor:
     """Copy an array to a device; a GPU is not waited for."""
     tensor = torch.from_numpy(np.ascontiguousarray(array))
@@ -82,6 +87,18 @@ def _positions(
     return table.index_select(0, on_device(faces, device))
 
 
+def sample_positions(
+    image: Tensor, u: NDArray[Any], v: NDArray[Any], interpolation: Interpolation
+) -> Tensor:
+    """Return values ``(..., h, w)`` of a panorama ``(..., H, W)`` at positions ``(h, w)``."""
+    columns, rows = (on_device(line, image.device) for line in (u, v))
+    if interpolation == "nearest":
+        index = nearest_equirect_index(columns, rows, (image.shape[-2], image.shape[-1]))
+        return image.flatten(-2)[..., index]
+    values = sample_tensor(image.flatten(0, -3), columns.flatten(), rows.flatten())
+    return values.reshape(*image.shape[:-2], *u.shape)
+
+
 def sample_tensor(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Interpolate a panorama bilinearly, differentiably on any device.
 
@@ -106,7 +123,7 @@ def _in_frame(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
 
 def _sampled(image: Tensor, positions: Tensor) -> Tensor:
     """Return bilinear values ``(n, C, h, w)`` of a panorama at positions ``(n, h, w, 2)``."""
-    framed = _framed(image if image.dtype == torch.float64 else image.float())[None]
+    framed = _framed(exact(image))[None]
     count, given = len(positions), positions.to(framed.dtype)
     if framed.requires_grad:  # the gradient of an expanded tensor takes n times its memory
         given = given.flatten(0, 1)[None]

@@ -15,29 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tangent_train import rendering
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid
 
-Renderer = Callable[..., Tensor]
-"""Function of pixels, a grid, whole numbers and options, in this order."""
 
-_RENDERERS: dict[str, Renderer] = {}
-
-
-def traceable(function: Any) -> Any:
-    """Let `traced` call a function by its name."""
-    _RENDERERS[function.__name__] = function
-    return function
-
-
-def is_traced(pixels: object) -> bool:
-    """Return True for a tensor in a function that `torch.compile` traces.
+def is_traced() -> bool:
+    """Return True in a function that `torch.compile` traces.
 
     Raises:
         SettingError: `torch.jit.trace` traces the function.
     """
-    if not isinstance(pixels, Tensor):
-        return False
     if torch.compiler.is_compiling():
         return True
     if torch._C._get_tracing_state() is not None:
@@ -49,7 +37,7 @@ def is_traced(pixels: object) -> bool:
 def traced(
     name: str, pixels: Any, grid: PinholeGrid, numbers: Iterable[Any] | None, *options: str
 ) -> Any:
-    """Add the call of a `traceable` function to the traced graph.
+    """Add the call of a function of `tangent_train.rendering` to the traced graph.
 
     Args:
         name: Name of the function.
@@ -74,6 +62,11 @@ def traced(
     )
 
 
+def _renderer(name: str) -> Callable[..., Tensor]:
+    renderer: Callable[..., Tensor] = getattr(rendering, name)
+    return renderer
+
+
 @lru_cache(maxsize=16)
 def _grid(
     axes: bytes,
@@ -93,11 +86,11 @@ def _render(
     pixels: Tensor, axes: Tensor, rotation: Tensor | None, pitch: float, size: list[int],
     kinds: list[bool], name: str, numbers: list[int] | None, options: str,
 ) -> Tensor:  # fmt: skip
-    """Call a `traceable` function."""
+    """Call a function of `tangent_train.rendering`."""
     turned = None if rotation is None else rotation.numpy(force=True).tobytes()
     sides = (size[0], size[1])
     grid = _grid(axes.numpy(force=True).tobytes(), turned, pitch, sides, tuple(kinds))
-    return _RENDERERS[name](pixels.detach(), grid, numbers, *options.split()).contiguous()
+    return _renderer(name)(pixels.detach(), grid, numbers, *options.split()).contiguous()
 
 
 @_render.register_fake
@@ -127,7 +120,7 @@ def _gradient(
 
     def differentiate() -> Tensor:
         pixels = gradient.new_zeros(shape).requires_grad_()
-        rendered = _RENDERERS[name](pixels, grid, numbers, *options.split())
+        rendered = _renderer(name)(pixels, grid, numbers, *options.split())
         return torch.autograd.grad(rendered, pixels, gradient.detach())[0].contiguous()
 
     with ThreadPoolExecutor(1) as new:  # this thread records no gradients inside of an operation

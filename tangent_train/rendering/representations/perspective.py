@@ -14,15 +14,13 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import lengths_of_rays, shift_range
 from tangent_train.rendering.kernels import NO_OWNERS, CanvasGeometry
 from tangent_train.rendering.representations.views import Views
-from tangent_train.rendering.resampling import Interpolation, Pixels, crop
+from tangent_train.rendering.resampling import Interpolation, Pixels, crop, is_tensor
 from tangent_train.rendering.tables import plane_rays
 
 _PAPER_FOV_DEG = 45.0
@@ -81,7 +79,9 @@ class PhotoCrops(Views):
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """See `Views`; arrays must be uint8 for ``bilinear``."""
         parts: Any = [crop(image, b, self.size, interpolation) for b in self.boxes[self.chosen]]
-        if isinstance(image, Tensor):
+        if is_tensor(image):
+            import torch
+
             crops = torch.stack(parts)
             return crops.flip(-1) if self.mirrored else crops
         crops = np.stack(parts)

@@ -11,17 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.rendering.forward import Blend, equirect_to_tangent
 from tangent_train.rendering.kernels import CanvasGeometry
-from tangent_train.rendering.resampling import Interpolation, Pixels, reduce_to_pitch
+from tangent_train.rendering.resampling import Interpolation, Pixels, is_tensor, reduce_to_pitch
 from tangent_train.rendering.tables import canvas_geometry, owners
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 RotationAugmentation = Literal["none", "yaw", "so3"]
 """Rotation of training panoramas: none, about the vertical, or uniformly over SO(3)."""
@@ -205,7 +207,7 @@ class PinholeViews(Views):
         images: Any = equirect_to_tangent(image, self.grid, self.faces, interpolation)
         if not self.mirrored:
             return images
-        if isinstance(image, Tensor):
+        if is_tensor(image):
             flipped: Any = images.flip(-1)
             return flipped
         mirrored: Any = np.ascontiguousarray(images[:, :, ::-1])

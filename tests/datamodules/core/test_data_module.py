@@ -228,7 +228,7 @@ def test_weights_are_those_of_the_formulas() -> None:
     for kind, expected in (("log", 1 / np.log(1.02 + shares)), ("sqrt", root / root.mean())):
         weights = class_weights(COUNTS, kind)  # type: ignore[arg-type]
         np.testing.assert_allclose(weights, np.insert(expected, 4, 0), rtol=1e-6)
-        assert weights.dtype == torch.float32
+        assert weights.dtype == np.float32
 
 
 def test_weights_without_labels_or_weighting() -> None:
