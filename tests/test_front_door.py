@@ -13,6 +13,7 @@ import pytest
 
 import tangent_train
 from tangent_train.errors import SettingError
+from tangent_train.geometry import CubeGrid
 from tangent_train.geometry.sphere import check_area
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tests.running import run_python
@@ -110,6 +111,8 @@ def test_modules_of_our_names_that_come_first_are_named(tmp_path: Path) -> None:
 
 UNTYPED: Any = tangent_train
 GRID = tangent_train.TangentGrid(0, 3)
+SIZE = (32, 32)
+RINGS = [{"pitch": 0, "views": 8}]
 PANORAMA = np.zeros((16, 32), np.uint8)
 
 
@@ -130,13 +133,30 @@ def test_arguments_of_other_types_are_named(wrong: Any) -> None:
 
 
 @pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        *(({"rings": None}, "rings"), ({"rings": [8]}, "ring"), ({"rings": "horizontal"}, "ring")),
+        ({"rings": [{"pitch": "0", "views": 8}]}, "pitch"),
+        *(({"fov_deg": ("90", 90)}, "fov"), ({"valid": [[True]]}, "valid")),
+    ],
+)
+def test_arguments_of_rings_of_other_types_are_named(given: dict[str, Any], name: str) -> None:
+    whole = {"rings": RINGS, "fov_deg": (90, 90), "size": SIZE}
+    with pytest.raises(TypeError, match=f"^{name}: found [A-Za-z]+; expected "):
+        UNTYPED.RingGrid(**whole | given)
+
+
+@pytest.mark.parametrize(
     "given",
-    [{"views": 5}, {"levels": "x"}, {"rotations": "x"}, {"device": 5.5}, {"base_level": [0]}],
+    [
+        *({"view_batch_size": -1}, {"view_batch_size": 0}, {"rotations": 0}),
+        *({"views": 5}, {"levels": "x"}, {"rotations": "x"}, {"device": 5.5}, {"base_level": [0]}),
+    ],
     ids=str,
 )
 def test_settings_of_other_types_are_named(given: dict[str, Any]) -> None:
     (name,) = given
-    with pytest.raises(SettingError, match=rf"^{name}: found .*; expected a valid "):
+    with pytest.raises(SettingError, match=rf"^{name}: found .*; expected (a valid|greater) "):
         UNTYPED.load("missing.ckpt", **given)
 
 
@@ -153,6 +173,14 @@ def test_an_area_of_another_type_is_named(area: Any) -> None:
             lambda: tangent_train.TangentGrid(0, 20),
             "rows of an image: found 1048576; .* from 1 to 32768",
         ),
+        (lambda: tangent_train.RingGrid([], (90, 90), SIZE), "number of rings: found 0; "),
+        (lambda: UNTYPED.RingGrid([{"pitch": 0}], (90, 90), SIZE), "views: found None; "),
+        (lambda: UNTYPED.RingGrid(RINGS, 90, SIZE), "fov_deg: found 90; expected two numbers"),
+        (lambda: UNTYPED.RingGrid(RINGS, (90, 90), 32), "size: found 32; expected two numbers"),
+        (lambda: tangent_train.RingGrid(RINGS, (90, 90), (32, 0)), "columns of an image: found 0"),
+        (lambda: CubeGrid(8, margin=UNTYPED), "margin: found <module"),
+        (lambda: UNTYPED.perspective(PANORAMA, {}, 0, 90, 8), "yaw, pitch and roll: found {}, 0"),
+        (lambda: tangent_train.apply(np.mean, PANORAMA, GRID, images_per_call=0), "images_per_ca"),
         (lambda: tangent_train.TangentGrid(9, 12), "base_level: found 9; .* from 0 to 8"),
         (lambda: tangent_train.TangentGrid(-1, 4), "base_level: found -1; "),
         (lambda: UNTYPED.TangentGrid(0, 4.5), "level: found 4.5; expected an integer"),

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hydra.utils import get_class
-from lightning.pytorch.loggers import (
-    CSVLogger,
-    Logger,
-    MLFlowLogger,
-    TensorBoardLogger,
-    WandbLogger,
-)
+from lightning.pytorch.loggers import CSVLogger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from tangent_train.config.build import build_from_config, filled
@@ -28,17 +24,21 @@ from tangent_train.files import load_plain, write_text
 _IDENTITIES = {CSVLogger: "version", MLFlowLogger: "run_id", WandbLogger: "id"}
 """Arguments that continue a run; its `version` is their value."""
 
+_AT_START = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2", "MLFLOW_HTTP_REQUEST_TIMEOUT": "15"}
+"""Environment variables, unless set, while loggers connect: MLflow's own wait for minutes."""
+
 
 def start_loggers(
     sections: Mapping[str, Any] | None,
     folder: Path,
     settings: Mapping[str, Any],
     resumed: Path | None = None,
-) -> list[Logger]:
-    """Build the loggers and log the settings of a new run; null arguments are those of the run.
+) -> list[Any]:
+    """Build the loggers and log the settings once; null arguments are those of the run.
 
     The run is named after its folder below ``runs``, the group after the folder that contains it.
-    ``loggers.json`` keeps the identities, with which a resumed run continues in the same place.
+    ``loggers.json`` keeps the loggers with their identities, with which a resumed run continues in
+    the same place.
 
     Args:
         sections: Settings of the loggers by name; None for no loggers.
@@ -51,10 +51,13 @@ def start_loggers(
     """
     file, loggers = folder / "loggers.json", {}
     stored = json.loads(file.read_bytes()) if resumed and file.is_file() else {}
-    step = None
-    if resumed and sections:
-        step = load_plain(resumed, "a checkpoint of a run", mmap=True)["global_step"]
+    reached: Any = {}
+    if resumed and stored:
+        reached = load_plain(resumed, "a checkpoint of a run", mmap=True)
     for name, section in (sections or {}).items():
+        step = reached["global_step"] if name in stored else None
+        added = {variable: _AT_START[variable] for variable in _AT_START.keys() - os.environ.keys()}
+        os.environ.update(added)
         try:
             loggers[name] = _build(name, section, folder, stored.get(name, {}), step)
             if step is None:
@@ -66,12 +69,15 @@ def start_loggers(
         except SettingError:
             raise
         except Exception as error:
-            found, remedy = first_line(error), f"To log elsewhere: ~logger.{name}"
+            place, found = f"logger.{name}", first_line(error)
+            remedy = f"To log elsewhere: ~{place}"
             expected = f"that {type(error).__module__.split('.')[0]} can start it"
-            raise SettingError(
-                f"logger.{name}", found=found, expected=expected, remedy=remedy
-            ) from error
-    _store(file, loggers)
+            raise SettingError(place, found=found, expected=expected, remedy=remedy) from error
+        finally:
+            for variable in added:
+                del os.environ[variable]
+    if loggers:
+        _store(file, stored, loggers)
     for name, logger in loggers.items():
         _guard(name, logger)
     return list(loggers.values())
@@ -109,32 +115,25 @@ def _continue_csv(logger: CSVLogger, step: int) -> None:
 
 
 @rank_zero_only
-def _store(file: Path, loggers: Mapping[str, Any]) -> None:
-    """Write the identities of the run in its loggers."""
-    found = {
-        name: {argument: logger.version}
-        for name, logger in loggers.items()
-        for kind, argument in _IDENTITIES.items()
-        if isinstance(logger, kind)
-    }
-    if found:
-        write_text(file, json.dumps(found) + "\n")
+def _store(file: Path, stored: dict[str, Any], loggers: Mapping[str, Any]) -> None:
+    """Add the loggers and the identities of the run in them to a file."""
+    for name, logger in loggers.items():
+        arguments = [argument for kind, argument in _IDENTITIES.items() if isinstance(logger, kind)]
+        stored[name] = dict.fromkeys(arguments, logger.version)
+    write_text(file, json.dumps(stored) + "\n")
 
 
 def _guard(name: str, logger: Any) -> None:
     """Print the first error of a logger in one line, after which it logs nothing more."""
     methods = "log_metrics", "save", "finalize"
 
-    def guarded(method: Callable[..., Any]) -> Callable[..., None]:
-        def call(*arguments: Any, **named: Any) -> None:
-            try:
-                method(*arguments, **named)
-            except Exception as error:
-                for other in methods:
-                    setattr(logger, other, lambda *_, **__: None)
-                print_text(f"logger.{name} logs nothing more: {first_line(error)}", error=True)
-
-        return call
+    def call(method: Callable[..., Any], *arguments: Any, **named: Any) -> None:
+        try:
+            method(*arguments, **named)
+        except Exception as error:
+            for other in methods:
+                setattr(logger, other, lambda *_, **__: None)
+            print_text(f"logger.{name} logs nothing more: {first_line(error)}", error=True)
 
     for method in methods:
-        setattr(logger, method, guarded(getattr(logger, method)))
+        setattr(logger, method, partial(call, getattr(logger, method)))

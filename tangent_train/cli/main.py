@@ -68,7 +68,7 @@ def _main(command: str) -> None:
     _print_version(command)
     import hydra
 
-    from tangent_train.cli.processes import in_sweep, run_job
+    from tangent_train.cli.processes import OF_SWEEPS, in_sweep, run_job
     from tangent_train.config.command_line import check_words
     from tangent_train.config.help import annotate, listed_by_files
     from tangent_train.config.settings import config_name, refuse_typed, validate
@@ -79,8 +79,8 @@ def _main(command: str) -> None:
             return run_job(command)
         with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions
             settings = validate(command, config)
-            unread = f"no such setting: tangent-{command} does not read it"
-            refuse_typed(settings.not_read, unread)
+            refuse_typed(settings.not_read, f"no such setting: tangent-{command} does not read it")
+            refuse_typed(OF_SWEEPS, f"a sweep: tangent-{command} -m …")
             import_module("tangent_train.cli.paths").check_paths(settings)
             return _run(command, settings)
 

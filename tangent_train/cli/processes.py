@@ -20,6 +20,9 @@ from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import quoted
 
+OF_SWEEPS = ("launcher", "sweep")
+"""Groups that only sweeps read."""
+
 OBJECTIVE_FILE = "validation.json"
 """File in a run's folder with the validation score of its best epoch."""
 
@@ -61,7 +64,7 @@ def run_job(command: str) -> float | None:
     """
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
-    arguments = typed_settings()
+    arguments = [text for text in typed_settings() if not text.startswith(OF_SWEEPS)]
     if (folder / "checkpoints" / "last.ckpt").exists():  # SLURM has started the job again
         arguments = [f"resume={quoted(folder)}"]
     sources = [s.path for s in hydra.runtime.config_sources if s.provider == "command-line"]

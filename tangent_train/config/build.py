@@ -97,7 +97,9 @@ def check_types(
     """
     called: Any = function
     try:
-        hints = get_type_hints(called.__init__ if isinstance(function, type) else called)
+        hints = get_type_hints(
+            called.__init__ if isinstance(function, type) else called, include_extras=True
+        )
     except NameError:  # names that are imported for type checkers only
         return {**values}
     kinds = {name: hints[name] for name, v in values.items() if name in hints and v is not None}

@@ -10,6 +10,7 @@ from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError
@@ -24,21 +25,24 @@ from tangent_train.config.settings import (
 from tangent_train.errors import SettingError, first_line, nearest
 from tangent_train.files import config_folder
 
-_POSITIONAL = ("checkpoint", "input", "output")
+_POSITIONAL = ("checkpoint", "model", "input", "output")
 """Settings that words without a name stand for in other programs, in this order."""
+
+_OF_FILES = {"import": ("file", "output"), "keypoints": ("left", "right", "output")}
+"""These settings by the command, if the first word is a file."""
 
 
 def check_words(command: str, arguments: Sequence[str]) -> None:
-    """Refuse options that Hydra lacks, and words without ``=``.
+    """Refuse options that Hydra lacks, words without ``=``, and groups without an option.
 
     Args:
         command: Name of the command, e.g. predict.
         arguments: Command line after the program's name.
 
     Raises:
-        SettingError: There is such a word.
+        SettingError: There is such a word or group.
     """
-    parser = get_args_parser()
+    parser, fields = get_args_parser(), SETTINGS[command].model_fields
     parser.allow_abbrev, parser.exit_on_error = False, False
     expected = "settings as name=value"
     try:
@@ -55,12 +59,24 @@ def check_words(command: str, arguments: Sequence[str]) -> None:
     words = [word for word in [*parsed.overrides, *others] if not re.search("[=~]", word)]
     if words:
         typed = {word.partition("=")[0] for word in parsed.overrides}
-        fields = SETTINGS[command].model_fields
-        names = [name for name in _POSITIONAL if name in fields and name not in typed]
+        order = _OF_FILES.get(command, _POSITIONAL) if Path(words[0]).suffix else _POSITIONAL
+        names = [name for name in order if name in fields and name not in typed]
         remedy = f"tangent-{command} --help lists them."
         if len(words) <= len(names):
             remedy = f"Did you mean {' '.join(map(typed_setting, names, words))}?"
         raise SettingError(words[0], found="a word without =", expected=expected, remedy=remedy)
+    for one in OverridesParser.create().parse_overrides(parsed.overrides):
+        group, value, options = one.key_or_group, one.value(), _options(one.key_or_group)
+        if options and not one.is_delete() and isinstance(value, bool | int | float | None):
+            expected = f"one of {', '.join(options)}, or ~{group}"
+            raise SettingError(group, found=one.get_value_element_as_str(), expected=expected)
+
+
+def _options(group: str) -> list[str]:
+    """Return the options of a group in this package."""
+    folder = config_folder() / group
+    files = (path.relative_to(folder) for path in folder.rglob("*.yaml"))
+    return sorted(path.with_suffix("").as_posix() for path in files)
 
 
 def typed_setting(name: str, value: str) -> str:
@@ -102,9 +118,7 @@ def _missing_option(error: MissingConfigException) -> SettingError:
     named = re.search("Available options in '(.*)'", str(error))
     group = named[1] if named else ""
     option = str(error.missing_cfg_file).removeprefix(f"{group}/")
-    files = (config_folder() / group).rglob("*.yaml")
-    own = {path.relative_to(config_folder() / group).with_suffix("").as_posix() for path in files}
-    options = sorted(own.union(error.options or ()))
+    options = sorted({*_options(group), *(error.options or ())})
     remedy = nearest(option, options)
     return SettingError(group, found=option, expected=f"one of {', '.join(options)}", remedy=remedy)
 

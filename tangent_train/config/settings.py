@@ -52,6 +52,9 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Section = dict[str, Any]
 """Settings of an option of a group."""
 
+_REPLACED = ("callbacks", "logger")
+"""Groups of which a resumed run may get another option."""
+
 Views = str | Section | None
 Blend = Literal["feather", "nearest"]
 
@@ -137,7 +140,7 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """number of rotations about the vertical to average over"""
     upright: Literal["pose", "auto"] | None = None
     """align with gravity: pose (tags of the file) | auto (the same, else estimated); null = off"""
-    max_tilt_deg: float = 60
+    max_tilt_deg: Annotated[float, Field(gt=0, le=180)] = 60
     """upright=auto: largest tilt to consider, in degrees"""
     mask: float | ExistingPath | None = None
     """panoramas: pixels that become unknown (0): a latitude (-60: below it), a PNG file (black) or
@@ -520,6 +523,7 @@ def config_name(command: str, arguments: Sequence[str]) -> str:
 
     Raises:
         DataError: The folder to resume is not that of a run.
+        SettingError: Another group is typed for a resumed run.
     """
     store = ConfigStore.instance().store
     store("settings", _defaults(SETTINGS[command]))
@@ -533,8 +537,15 @@ def config_name(command: str, arguments: Sequence[str]) -> str:
         expected = "the folder of a run, which tangent-train printed"
         raise DataError(file.parent, found="no config.yaml", expected=expected)
     config: Any = OmegaConf.to_container(OmegaConf.load(file))
-    defaults = ["_self_", {"override hydra/job_logging": "none"}]
-    store("resumed", {**config, "defaults": defaults, "hydra": {"run": {"dir": str(run)}}})
+    names = {text.partition("=")[0] for text in arguments}
+    for group in sorted(names - {*_REPLACED}):
+        if (config_folder() / group).is_dir():
+            expected = f"a single setting, such as data.root=…, or {' or '.join(_REPLACED)}="
+            raise SettingError(f"{group}=, when resuming", found="a group", expected=expected)
+    replaced = dict.fromkeys(names.intersection(_REPLACED))
+    groups = [*({group: None} for group in replaced), {"override hydra/job_logging": "none"}]
+    hydra = {"run": {"dir": str(run)}}
+    store("resumed", {**config, **replaced, "defaults": ["_self_", *groups], "hydra": hydra})
     return "resumed"
 
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
+from numbers import Real
 from typing import Any, Self
 
 import numpy as np
@@ -58,10 +59,7 @@ class PinholeGrid:
         is_complete: bool = False,
     ) -> None:
         self._axes = axes
-        self.size = (
-            at_least("rows of an image", size[0], 1, MOST_ROWS),
-            at_least("columns of an image", size[1], 1, MOST_ROWS),
-        )
+        self.size = _checked_size(size)
         self.pitch = pitch
         self.rotation = None if rotation is None else checked_rotation(rotation)
         self.is_overlapping = is_overlapping
@@ -374,7 +372,7 @@ class CubeGrid(PinholeGrid):
     """
 
     def __init__(self, dim: int, rotation: ArrayLike | None = None, margin: int = 0) -> None:
-        dim = at_least("dim", dim, 2 + 2 * margin)
+        dim = at_least("dim", dim, 2 + 2 * at_least("margin", margin, 0))
         x, y, z = np.eye(3)
         axes = _upright_axes([x, y, -x, -y, z, -z])
         pitch = 2 / (dim - 2 * margin)
@@ -420,19 +418,41 @@ class RingGrid(PinholeGrid):
         by_owners: bool = True,
         is_complete: bool = True,
     ) -> None:
-        across, down = map(half_width, fov_deg)
-        pitch = max(2 * across / size[1], 2 * down / size[0])
-        centers_deg = [
-            (360 / ring["views"] * number, ring["pitch"])
-            for ring in rings
-            for number in range(int(ring["views"]))
-        ]
-        axes = _upright_axes(lonlat_to_xyz(np.radians(centers_deg)))
-        super().__init__(axes, (size[0], size[1]), pitch, rotation, is_complete=is_complete)
+        across, down = map(half_width, _pair("fov_deg", fov_deg))
+        rows, columns = _checked_size(size)
+        pitch = max(2 * across / columns, 2 * down / rows)
+        axes = _upright_axes(lonlat_to_xyz(np.radians(_ring_centers(rings))))
+        super().__init__(axes, (rows, columns), pitch, rotation, is_complete=is_complete)
         resting = self.with_rotation(None)
+        check_type("valid", valid, (np.ndarray, type(None)), "an array of booleans")
         if is_complete:
             check_coverage([resting], valid, by_owners=by_owners)
             self.is_overlapping = overlaps(resting, valid)
+
+
+def _ring_centers(rings: Any) -> list[tuple[float, float]]:
+    """Return longitudes and latitudes of the centers of views in rings, in degrees."""
+    check_type("rings", rings, Sequence, "a list of rings")
+    at_least("number of rings", len(rings), 1)
+    centers: list[tuple[float, float]] = []
+    for ring in rings:
+        check_type("ring", ring, Mapping, "its pitch and views, e.g. {'pitch': 0, 'views': 8}")
+        check_type("pitch", ring.get("pitch"), Real, "degrees")
+        views = at_least("views", ring.get("views"), 1)
+        centers += [(360 / views * number, ring["pitch"]) for number in range(views)]
+    return centers
+
+
+def _checked_size(size: Any) -> tuple[int, int]:
+    sides = zip(("rows", "columns"), _pair("size", size), strict=True)
+    rows, columns = (at_least(f"{name} of an image", side, 1, MOST_ROWS) for name, side in sides)
+    return rows, columns
+
+
+def _pair(name: str, value: Any) -> tuple[Any, Any]:
+    if np.shape(value) != (2,):
+        raise SettingError(name, found=repr(value), expected="two numbers")
+    return value[0], value[1]
 
 
 def cell_neighbors(centers_xyz: NDArray[np.float64]) -> NDArray[np.int32]:

@@ -57,7 +57,7 @@ def perspective_grid(
     pitch = max(2 * across / columns, least)
     try:
         angles = np.broadcast_arrays(*map(_degrees, (yaw_deg, pitch_deg, roll_deg)))
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         found = ", ".join(str(angle) for angle in (yaw_deg, pitch_deg, roll_deg))
         expected = "finite degrees: numbers, or lists of one length"
         raise SettingError("yaw, pitch and roll", found=found, expected=expected) from error

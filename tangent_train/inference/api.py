@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
 
@@ -25,6 +26,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import PositiveInt
 from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps
@@ -37,7 +39,7 @@ from datamodules.core.label_map import (
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.config.build import checks_types
-from tangent_train.errors import SettingError, check_choice, check_type, width_height
+from tangent_train.errors import SettingError, at_least, check_choice, check_type, width_height
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
@@ -99,10 +101,10 @@ def load(
     levels: Levels = None,
     base_level: int | None = None,
     blend: Blend = "feather",
-    rotations: int = 1,
+    rotations: PositiveInt = 1,
     views: ViewChoice = None,
     fill: Fill | None = None,
-    view_batch_size: int | None = None,
+    view_batch_size: PositiveInt | None = None,
     min_confidence: float = 0.0,
     align: Align | None = None,
     trust: str | Sequence[str] = (),
@@ -311,6 +313,7 @@ class Network:
         if fov is not None:
             return read_photo(image, fov, of_size)
         check_choice("upright", upright or "pose", ("pose", "auto"))
+        check_type("max_tilt_deg", max_tilt_deg, Real, "degrees")
         check_choice("eye", eye or "left", ("left", "right"))
         panorama = read_panorama(image, area, upright, of_size, eye)
         if upright == "auto":
@@ -404,6 +407,8 @@ def apply(
     check_grid(grid)
     blend = blend_back(grid, blend)
     check_panorama(panorama, "bilinear")
+    if images_per_call is not None:
+        at_least("images_per_call", images_per_call, 1)
     step = images_per_call or views_per_forward(grid.size)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     shape, views = (rows, columns), PinholeViews(grid)

@@ -82,6 +82,16 @@ class Schedule:
     frequency: int = 1
     monitor: str | None = None
 
+    def length(self, trainer: Any) -> Any:
+        """Return the epochs or steps of the schedule; None if it has no end."""
+        if {"T_max", "total_steps"}.isdisjoint(getattr(self.build, "keywords", {})):
+            return None
+        steps = trainer.estimated_stepping_batches
+        per_epoch = trainer.num_training_batches / trainer.accumulate_grad_batches  # may be inf
+        if self.interval == "step" or math.isinf(per_epoch):
+            return steps
+        return math.ceil(steps / max(1, math.ceil(per_epoch)))
+
     def configure(
         self, optimizer: Optimizer, trainer: Any, monitor: str, mode_of: Callable[[str], str]
     ) -> dict[str, Any]:
@@ -104,11 +114,7 @@ class Schedule:
         if "mode" in settings and settings["mode"] is None:
             filled["mode"] = mode_of(monitored)
         if "total_steps" in settings and settings["total_steps"] is None:
-            steps = trainer.estimated_stepping_batches
-            if self.interval == "epoch":
-                per_epoch = trainer.num_training_batches / trainer.accumulate_grad_batches
-                steps = math.ceil(steps / max(1, math.ceil(per_epoch)))
-            filled["total_steps"] = int(steps) // self.frequency
+            filled["total_steps"] = int(self.length(trainer)) // self.frequency
         return {
             "scheduler": self.build(optimizer, **filled),
             "interval": self.interval,

@@ -10,6 +10,7 @@ from typing import Any, Self
 import lightning
 import torch
 from numpy.typing import NDArray
+from pydantic import PositiveInt
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
@@ -74,13 +75,13 @@ class Task(lightning.LightningModule, ABC):
         head: Head,
         optimizer: Callable[..., Optimizer] | None,
         scheduler: Schedule | Callable[..., LRScheduler] | None = None,
-        view_batch_size: int | None = None,
+        view_batch_size: PositiveInt | None = None,
         channels_last: bool = False,
         compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
         frozen: Sequence[str] = (),
         backbone_lr_factor: float = 1.0,
         auxiliary_weight: float = 0.4,
-        eval_view_batch_size: int = 32,
+        eval_view_batch_size: PositiveInt = 32,
     ) -> None:
         super().__init__()
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
@@ -91,6 +92,7 @@ class Task(lightning.LightningModule, ABC):
         self.representation, self.head = representation, head
         self.make_optimizer: Any = optimizer
         self.schedule, self.backbone_lr_factor = scheduler, backbone_lr_factor
+        self._schedule_length: float | None = None
         self.view_batch_size = view_batch_size
         self.auxiliary_weight = auxiliary_weight
         self.eval_view_batch_size = eval_view_batch_size
@@ -222,11 +224,13 @@ class Task(lightning.LightningModule, ABC):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Store `fresh`; keep the file of earlier weights if these are not finite."""
         check_weights(self)
+        checkpoint["schedule_length"] = self._schedule_length
         if self.fresh is not None:
             checkpoint["fresh"] = sorted(self.fresh)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore `fresh`, before the optimizer is built."""
+        self._schedule_length = checkpoint.get("schedule_length")
         fresh = checkpoint.get("fresh")
         self.fresh = None if fresh is None else frozenset(map(str, fresh))
 
@@ -280,7 +284,11 @@ class Task(lightning.LightningModule, ABC):
     # Optimizer and schedule
 
     def configure_optimizers(self) -> Any:
-        """Build the optimizer, and the scheduler if there is one."""
+        """Build the optimizer, and the scheduler if there is one.
+
+        Raises:
+            SettingError: The schedule of a resumed training ends at another step.
+        """
         groups = parameter_groups(self.network, self.fresh or (), self.backbone_lr_factor)
         optimizer = self.make_optimizer(groups)
         for group in optimizer.param_groups:
@@ -289,6 +297,12 @@ class Task(lightning.LightningModule, ABC):
         if schedule is None:
             return optimizer
         schedule = schedule if isinstance(schedule, Schedule) else Schedule(schedule)
+        before, self._schedule_length = self._schedule_length, schedule.length(self.trainer)
+        if before not in (None, self._schedule_length):
+            name, found = "length of the training", f"{self._schedule_length} {schedule.interval}s"
+            expected = f"{before}, when resuming: the end of the schedule"
+            remedy = "Start a new run: init_from=<run>/checkpoints/last.ckpt"
+            raise SettingError(name, found=found, expected=expected, remedy=remedy)
         built = schedule.configure(optimizer, self.trainer, self.monitor, self.head.mode_of)
         return {"optimizer": optimizer, "lr_scheduler": built}
 

@@ -130,15 +130,23 @@ def test_without_validation_the_last_epoch_is_tested(rooms: str, tmp_path: Path,
     run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
     first = (checkpoints / "best.ckpt").read_bytes()
     assert first == (checkpoints / "last.ckpt").read_bytes()
-    run("train", "resume=run", "trainer.max_epochs=2")
+    run("train", "resume=run", "trainer.max_epochs=2", "logger=csv", "callbacks=model_summary")
+    assert (tmp_path / "run" / "csv" / "version_0" / "hparams.yaml").is_file()
     assert first != (checkpoints / "best.ckpt").read_bytes()
     assert results(tmp_path / "run")["images"] == 2
     with pytest.raises(SystemExit, match=r"hydra\.run\.dir: found .*run, the folder of another"):
         run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
     config = (tmp_path / "run" / "config.yaml").read_text()
     assert "max_epochs: 2" in config
+    assert [name in config for name in ("CSV", "TensorBoard", "model_summary:")] == [
+        True,
+        False,
+        True,
+    ]
     with pytest.raises(SystemExit, match=r"network\.widths: found a value; .*start a new run"):
         run("train", "resume=run", "network.widths=[8]")
+    with pytest.raises(SystemExit, match=r"network=, when resuming: found a group; "):
+        run("train", "resume=run", "network=unet")
     assert (tmp_path / "run" / "config.yaml").read_text() == config
 
 

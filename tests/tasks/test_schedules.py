@@ -81,6 +81,25 @@ def test_a_resumed_schedule_continues_as_if_it_had_not_stopped(name: str, tmp_pa
     assert begun + rest == pytest.approx(whole)
 
 
+@pytest.mark.parametrize(
+    ("schedule", "length"),
+    [
+        (Schedule(partial(lr_scheduler.OneCycleLR, max_lr=LR, total_steps=_NULL), "step"), 6),
+        (Schedule(partial(warmup_cosine, total_steps=_NULL), "step"), 6),
+        (partial(lr_scheduler.CosineAnnealingLR, T_max=2), 2),
+    ],
+)
+@pytest.mark.parametrize("longer", [1, 3])
+def test_a_schedule_with_an_end_is_not_resumed_for_another_length(
+    schedule: Any, length: int, longer: int, tmp_path: Path
+) -> None:
+    """Before the first step; with the same length, a finished training resumes."""
+    _train(tmp_path, schedule, max_epochs=2)
+    assert _train(tmp_path, schedule, resume=True, max_epochs=2) == []
+    with pytest.raises(SettingError, match=f"found .*; expected {length}, when resuming"):
+        _train(tmp_path, schedule, resume=True, max_epochs=longer)
+
+
 def test_the_number_of_warm_up_steps_is_rounded() -> None:
     optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=LR)
     schedule = warmup_cosine(optimizer, total_steps=11, warmup_share=0.25)  # 2.75
