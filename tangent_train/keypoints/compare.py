@@ -22,6 +22,7 @@ from tangent_train.geometry import (
     random_rotation,
 )
 from tangent_train.geometry.coverage import is_valid
+from tangent_train.geometry.sphere import Floats
 from tangent_train.keypoints.covisibility import (
     DepthView,
     correct_matches,
@@ -29,7 +30,6 @@ from tangent_train.keypoints.covisibility import (
     visible_from,
 )
 from tangent_train.keypoints.features import (
-    Floats,
     SphericalKeypoints,
     detect_on_equirect,
     detect_on_tangent_images,

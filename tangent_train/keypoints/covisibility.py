@@ -15,7 +15,8 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
     xyz_to_lonlat,
 )
-from tangent_train.keypoints.features import Floats, angles_between
+from tangent_train.geometry.sphere import Floats
+from tangent_train.keypoints.features import angles_between
 
 _TOLERANCE, _TOLERANCE_M = 0.03, 0.03
 """Occlusion tolerance behind a surface: share of the distance, and meters."""

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import of_extra
 from tangent_train.geometry import PanoramaPose
-from tangent_train.keypoints.features import Floats, angles_between
+from tangent_train.geometry.sphere import Floats
+from tangent_train.keypoints.features import angles_between
 
 _CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
 """From the axes of `tangent_train.geometry` to COLMAP's; a reflection."""

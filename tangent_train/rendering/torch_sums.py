@@ -61,25 +61,25 @@ class Taps(NamedTuple):
     """A sparse matrix: the pixels of views whose weighted sums are the pixels of a canvas.
 
     Attributes:
-        index: ``(E,)`` flat indices of pixels of the views ``(N, h, w)``, int32; N h w where a
+        source: ``(E,)`` flat indices of pixels of the views ``(N, h, w)``, int32; N h w where a
             view may cover the pixel of the canvas, but does not.
         weight: ``(E,)`` weights.
         first: ``(P + 1,)`` first entry of each pixel of the canvas, and E; int32.
     """
 
-    index: Tensor
+    source: Tensor
     weight: Tensor
     first: Tensor
 
     def sums(self, values: Tensor) -> Tensor:
         """Return the sums ``(P, K)`` of values ``(N h w + 1, K)``: pixels of views, and zeros."""
-        index, weight, first = self
+        source, weight, first = self
         how: Any = {"mode": "sum", "per_sample_weights": weight, "include_last_offset": True}
-        return embedding_bag(index, values, first, **how)
+        return embedding_bag(source, values, first, **how)
 
     def transposed(self, count: int) -> Taps:
         """Return the transposed matrix, with one row for each of `count` values."""
-        index, order = self.index.sort(stable=True)
+        index, order = self.source.sort(stable=True)
         numbers = torch.arange(max(len(index), count + 1), dtype=torch.int32, device=index.device)
         first = torch.searchsorted(index, numbers[: count + 1], out_int32=True)
         entries = numbers[: len(index)]
