@@ -66,7 +66,7 @@ def test_stereo_panoramas_are_among_the_problems(root: Path, capsys: Capture, su
         _checked(root, capsys)
     assert ended.value.code
     out = " ".join(capsys.readouterr().out.split())
-    assert f"b{suffix}: found a stereo panorama (left-right), by its metadata" in out
+    assert f"b{suffix} a stereo panorama (left-right), by its metadata" in out
 
 
 def test_colors_of_12_bits_are_among_the_warnings(
