@@ -1,9 +1,9 @@
 """Every figure has one home: a CSV file in ``docs/results/data``.
 
 A comment before a table or paragraph names the file: ``<!-- data: demo.csv -->``. A table of a
-results page has rows and columns of its file, and every file is shown or linked. In README.md, a
-table or paragraph with a score names one or more files, and its figures are found in them;
-``published.csv`` is in `tangent_train.results`.
+results page has rows and columns of its file, and every file is shown or linked. In README.md
+and the paper's experiments, a table or paragraph with a score names one or more files, and its
+figures are found in them; ``published.csv`` is in `tangent_train.results`.
 """
 
 from __future__ import annotations
@@ -148,8 +148,10 @@ def test_every_data_file_is_shown_or_linked() -> None:
     assert shown | linked == {path.name for path in DATA.glob("*.csv")}
 
 
-def test_figures_of_the_readme_are_in_the_data() -> None:
-    for text, files in blocks((ROOT / "README.md").read_text(encoding="utf-8")):
+@pytest.mark.parametrize("name", ["README.md", "docs/reference/experiments.md"])
+def test_figures_outside_the_results_are_in_the_data(name: str) -> None:
+    written = (ROOT / name).read_text(encoding="utf-8").partition("<!-- generated -->")[0]
+    for text, files in blocks(written):
         if SCORE.search(text) or text.startswith("|") or files:
             prose = re.sub(r"`[^`]*`|\]\([^)]*\)", "", text)
             for figure in FIGURE.findall(prose):
