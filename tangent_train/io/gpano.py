@@ -265,6 +265,18 @@ def eye_part(
     )
 
 
+def refuse_stereo(path: Path) -> None:
+    """Raise DataError if an image of a data set is stereo by its tags."""
+    stated = read_tags(path).get("StereoMode", "").lower()
+    if stated in _LAYOUTS:
+        raise DataError(
+            path,
+            found=f"a stereo panorama ({stated}), by its metadata",
+            expected="one picture",
+            remedy="Cut out the picture of one eye, from labels and depth too, and remove the tag.",
+        )
+
+
 def shape_of(size: tuple[int, int], part: tuple[slice, slice]) -> tuple[int, int]:
     """Return rows and columns of a part of an image, see `eye_part`."""
     rows, columns = (len(range(n)[taken]) for n, taken in zip(size, part, strict=True))
@@ -315,9 +327,10 @@ def check_resolution(
         angles: The area in degrees; None for the whole sphere.
 
     Raises:
-        DataError: Its pixels would not be square.
+        DataError: Its pixels would not be square, or it is stereo by its tags.
         SettingError: It has fewer pixels.
     """
+    refuse_stereo(path)
     whole = check_area(angles) if angles is None else angles
     rows = read_area(path, size, whole, _SAME_AREA).full_shape[0]
     if size[1] < canvas.image_shape[1] - 1:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import math
 import mmap
+import os
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -51,6 +54,7 @@ READABLE_SUFFIXES = (*_WRITABLE, ".npy", ".exr")
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
 _FULL_RANGE = 2**14  # 16-bit colors below it probably have 14 bits or fewer
 _has_warned = mmap.mmap(-1, 1)  # shared with forked processes, which read training data
+_MOST_XMP = 2**24
 _FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
 _UNSIGNED = 1  # SampleFormat of TIFF
 _MAX_DEPTH_M = 1e4  # larger depth is missing: some files have 1e10 there
@@ -231,10 +235,27 @@ def read_xmp(path: Path) -> bytes:
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         return b""
     with _opened(path), Image.open(path, formats=IMAGE_FORMATS) as image:
-        if image.format == "PNG":
-            image.load()  # programs write the packet behind the pixels too
-        packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    return packet.encode() if isinstance(packet, str) else bytes(packet)
+        if image.format != "PNG":
+            return bytes(image.info.get("xmp", b""))
+    return _png_xmp(path)
+
+
+def _png_xmp(path: Path) -> bytes:
+    """Return the XMP packet of a PNG file, which many programs write behind the pixels."""
+    with path.open("rb") as file:
+        file.seek(8)
+        while len(header := file.read(8)) == 8:
+            length, name = struct.unpack(">I4s", header)
+            if name != b"iTXt":
+                file.seek(length + 4, os.SEEK_CUR)  # and its checksum
+                continue
+            keyword, _, content = file.read(length).partition(b"\0")
+            file.seek(4, os.SEEK_CUR)
+            if keyword == b"XML:com.adobe.xmp":
+                text = content[2:].split(b"\0", 2)[-1]
+                is_packed = content[:1] == b"\1"
+                return zlib.decompressobj().decompress(text, _MOST_XMP) if is_packed else text
+    return b""
 
 
 def read_image_size(path: Path) -> tuple[int, int]:

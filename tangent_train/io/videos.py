@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import DataError, of_extra
 from tangent_train.files import atomic_path, checked_file
 from tangent_train.io.gpano import PART_TAGS
+from tangent_train.io.mp4_boxes import spherical_boxes
 from tangent_train.threads import in_threads
 
 _READERS = "mov,matroska,avi"
@@ -39,6 +40,7 @@ _STEREO = dict.fromkeys(range(3, 8), "interleaved pictures of two eyes (stereo)"
 """Values of FFmpeg's side data, ``AVSphericalProjection`` and ``AVStereo3DType``."""
 _HALVES = {(1, 0): "left-right", (1, 1): "right-left", (2, 0): "top-bottom", (2, 1): "bottom-top"}
 """`StereoMode` by ``AVStereo3DType`` and inversion: the half of the left eye is named first."""
+_MODES = ("mono", *_HALVES.values())
 _WHOLE = (slice(None), slice(None))
 _AHEAD = 2
 _USUAL_RATE = 30
@@ -256,12 +258,17 @@ def _display(path: Path, stream: Any, frame: Any) -> _Display:
 
 
 def _tags(path: Path, frame: Any) -> dict[str, str]:
-    """Return the tags of `read_video_tags`, from the side data of the first frame."""
+    """Return the tags of `read_video_tags`, from side data of the first frame, and boxes."""
     data = {kind: frame.side_data.get(kind) for kind in ("SPHERICAL", "STEREO3D")}
     sphere, stereo = (
         np.frombuffer(bytes(found or bytes(32))[:32], np.int32).tolist() for found in data.values()
     )
-    if found := _PROJECTIONS.get(sphere[0]) or _STEREO.get(stereo[0]):
+    mode, is_mesh = spherical_boxes(path)
+    mode = mode or _HALVES.get((stereo[0], stereo[1] & 1), "mono")
+    found = _PROJECTIONS.get(sphere[0]) or _STEREO.get(stereo[0])
+    if is_mesh or mode not in _MODES:
+        found = "a mesh projection" if is_mesh else f"stereo of {mode}"
+    if found:
         raise DataError(
             path,
             found=f"a video with {found}, by its metadata",
@@ -269,9 +276,7 @@ def _tags(path: Path, frame: Any) -> dict[str, str]:
             remedy="Convert it, for example with FFmpeg's filter v360 or stereo3d. To remove "
             "wrong metadata: ffmpeg -i <video> -c copy <new>.mp4.",
         )
-    tags = {}
-    if mode := _HALVES.get((stereo[0], stereo[1] & 1)):
-        tags["StereoMode"] = mode
+    tags = {} if mode == "mono" else {"StereoMode": mode}
     if data["SPHERICAL"]:
         tags["PosePitchDegrees"], tags["PoseRollDegrees"] = (str(n / 2**16) for n in sphere[2:4])
     if sphere[0] == _TILE:  # shares of the sphere that are cropped at its edges

@@ -138,14 +138,8 @@ def cached(
     return (_ROTATED if is_rotated else TABLES).get(key, build)
 
 
-def cached_of(
-    grid: PinholeGrid,
-    key: tuple[Hashable, ...],
-    build: Callable[[], Value],
-    device: torch.device | None = None,
-) -> Value:
-    """Return the table of a key and a grid, see `cached`."""
-    return cached((grid, *key), build, is_rotated=grid.rotation is not None, device=device)
+def _cached(grid: PinholeGrid, key: tuple[Hashable, ...], build: Callable[[], Value]) -> Value:
+    return cached((grid, *key), build, is_rotated=grid.rotation is not None)
 
 
 def forward_map(
@@ -166,7 +160,7 @@ def forward_map(
     def build() -> EquirectMap:
         return EquirectMap.of(*positions_of_pixels(grid, shape, faces, dtype), shape)
 
-    return cached_of(grid, ("forward", shape, tuple(faces.tolist()), dtype), build)
+    return _cached(grid, ("forward", shape, tuple(faces.tolist()), dtype), build)
 
 
 def positions_of_pixels(
@@ -192,7 +186,7 @@ def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
         over_rows(_write_owners, *shape, *mesh, *rays, face)
         return (face,)
 
-    return cached_of(grid, ("owners", shape), build)[0]
+    return _cached(grid, ("owners", shape), build)[0]
 
 
 def _inner_cosine(grid: PinholeGrid) -> float:
@@ -321,7 +315,7 @@ def _covered_spans(
         over_rows(_write_spans, shape[0], len(faces), edges, sphere_rays(shape)[1], shape[1], spans)
         return (spans,)
 
-    return cached_of(grid, ("spans", shape, tuple(faces.tolist())), build)[0]
+    return _cached(grid, ("spans", shape, tuple(faces.tolist())), build)[0]
 
 
 @njit_exact

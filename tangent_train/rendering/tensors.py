@@ -13,9 +13,11 @@ import numpy as np
 import torch
 from torch.nn.functional import embedding_bag, grid_sample
 
-from tangent_train.rendering.tables import cached_of, map_dtype, positions_of_pixels
+from tangent_train.rendering.tables import Value, cached, map_dtype, positions_of_pixels
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable
+
     from numpy.typing import NDArray
     from torch import Tensor
 
@@ -33,6 +35,18 @@ def on_device(array: NDArray[Any], device: torch.device) -> Tensor:
     tensor = torch.from_numpy(np.ascontiguousarray(array))
     pinned = tensor.pin_memory() if device.type == "cuda" else tensor
     return pinned.to(device, non_blocking=True)
+
+
+def cached_tensors(
+    key: Hashable, build: Callable[[], Value], *, is_rotated: bool, device: torch.device
+) -> Value:
+    """Return a table of tensors, see `cached`; later uses may need gradients."""
+
+    def build_normal() -> Value:
+        with torch.inference_mode(False):
+            return build()
+
+    return cached(key, build_normal, is_rotated=is_rotated, device=device)
 
 
 def render_tensor(
@@ -81,7 +95,8 @@ def _positions(
         return (_in_frame(u, v, shape),)
 
     key = "positions", device, shape, dtype, interpolation, tuple(kept.tolist())
-    table = cached_of(grid, key, build, device)[0]
+    is_rotated = grid.rotation is not None
+    table = cached_tensors((grid, *key), build, is_rotated=is_rotated, device=device)[0]
     if np.array_equal(kept, faces):
         return table
     return table.index_select(0, on_device(faces, device))

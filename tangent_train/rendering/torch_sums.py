@@ -18,8 +18,7 @@ import numpy as np
 import torch
 from torch.nn.functional import embedding_bag
 
-from tangent_train.rendering.tables import cached
-from tangent_train.rendering.tensors import on_device
+from tangent_train.rendering.tensors import cached_tensors, on_device
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -264,10 +263,10 @@ class _Matrix:
             part,
         )
         where: Any = {"is_rotated": self._views.is_rotated, "device": self._device}
-        taps = cached(key, lambda: build(*part), **where)
+        taps = cached_tensors(key, lambda: build(*part), **where)
         if not values.requires_grad:
             return taps.sums(values)
-        back = cached((*key, "back"), lambda: taps.transposed(self._count), **where)
+        back = cached_tensors((*key, "back"), lambda: taps.transposed(self._count), **where)
         return _Product.apply(values, taps, back)
 
     def _owned(self, top: int, bottom: int) -> Taps:

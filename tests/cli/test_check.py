@@ -12,7 +12,7 @@ from tangent_train.cli.check import check
 from tangent_train.cli.prepare import prepare
 from tangent_train.io import pixel_files
 from tangent_train.io.pixel_files import write_pixels
-from tests.datamodules.data_files import write_png
+from tests.datamodules.data_files import save_tagged, write_png
 from tests.datamodules.folder.folder_format import save, write_classes
 from tests.running import Capture, composed_settings
 
@@ -54,6 +54,19 @@ def test_shares_and_classes_that_do_not_occur(root: Path, capsys: Capture) -> No
         "Warning: Classes without a pixel for test: door, sofa (2 of 4).",
     ]
     assert "0 problems and 2 warnings; 3 panoramas of" in err
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_stereo_panoramas_are_among_the_problems(root: Path, capsys: Capture, suffix: str) -> None:
+    """One picture with two halves of 180°, as its tags say, has the size of a panorama."""
+    (root / "images" / "b.png").unlink()
+    save_tagged(root / "images" / f"b{suffix}", {"StereoMode": "left-right"}, (32, 64))
+    write_classes(root, [None, "door", "wall", "floor", "sofa"])
+    with pytest.raises(SystemExit) as ended:
+        _checked(root, capsys)
+    assert ended.value.code
+    out = " ".join(capsys.readouterr().out.split())
+    assert f"b{suffix} a stereo panorama (left-right), by its metadata" in out
 
 
 def test_colors_of_12_bits_are_among_the_warnings(

@@ -38,6 +38,17 @@ def rendered(room: Path, tmp_path: Path) -> Path:
 # There and back.
 
 
+@pytest.mark.parametrize(("eye", "other"), [("left", "right"), ("right", "left")])
+def test_the_picture_of_one_eye_is_rendered(tmp_path: Path, eye: str, other: str) -> None:
+    pictures = {eye: smooth(), other: 255 - smooth()}
+    write_pixels(tmp_path / "a.png", np.concatenate([pictures["left"], pictures["right"]]))
+    render_with(input=tmp_path / "a.png", output=tmp_path / "out", base_level=0, eye=eye)
+    files = read_cameras(tmp_path / "out" / "a" / "cameras.json").files
+    expected = equirect_to_tangent(smooth(), TangentGrid(0, 5))
+    for file, image in zip(files, expected, strict=True):
+        np.testing.assert_array_equal(_read(tmp_path / "out" / "a" / file), image)
+
+
 def test_channels_of_openexr_images(tmp_path: Path) -> None:
     path, colors = tmp_path / "a.exr", smooth().astype(np.float32)
     channels = {c: colors[..., i].copy() for i, c in enumerate("RGB")}

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, PngImagePlugin
 
 from datamodules.core.data_module import DataModule
 from datamodules.core.files import Split
@@ -184,6 +185,17 @@ def hide_start(path: Path, seconds: float) -> None:
     duration, start = struct.unpack_from(">Ii", data, place)
     struct.pack_into(">Ii", data, place, duration, start + ticks)
     path.write_bytes(data)
+
+
+def save_tagged(path: Path, tags: Mapping[str, str], shape: tuple[int, int] = (40, 60)) -> Path:
+    """Save a black image with GPano tags."""
+    xmp = gpano_xmp(tags)
+    text = PngImagePlugin.PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    formats: dict[str, Any] = {".png": {"pnginfo": text}, ".tif": {"tiffinfo": {700: xmp}}}
+    settings = formats.get(path.suffix, {"xmp": xmp})
+    Image.new("RGB", (shape[1], shape[0])).save(path, **settings)
+    return path
 
 
 def stereo_box(mode: int) -> bytes:

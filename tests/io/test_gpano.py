@@ -2,17 +2,17 @@ from __future__ import annotations
 
 import io
 import zlib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image, PngImagePlugin
+from PIL import Image
 
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_to_lonlat
+from tangent_train.inference.images import read_panorama
 from tangent_train.io.gpano import (
     PART_TAGS,
     Eye,
@@ -30,19 +30,9 @@ from tests.datamodules.data_files import (
     gpano_xmp,
     png_bytes,
     png_chunk,
+    save_tagged,
     xmp_packet,
 )
-
-
-def _save(path: Path, tags: Mapping[str, str], shape: tuple[int, int] = (40, 60)) -> Path:
-    xmp = gpano_xmp(tags)
-    text = PngImagePlugin.PngInfo()
-    text.add_itxt("XML:com.adobe.xmp", xmp.decode())
-    formats: dict[str, Any] = {".png": {"pnginfo": text}, ".tif": {"tiffinfo": {700: xmp}}}
-    settings = formats.get(path.suffix, {"xmp": xmp})
-    Image.new("RGB", (shape[1], shape[0])).save(path, **settings)
-    return path
-
 
 _AREA = PanoramaArea((180, 360), (30, 70), (100, 160), (40, 60))
 
@@ -50,7 +40,7 @@ _AREA = PanoramaArea((180, 360), (30, 70), (100, 160), (40, 60))
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
 @pytest.mark.parametrize("projection", ["equirectangular", "Equirectangular", "EQUIRECTANGULAR"])
 def test_tags_of_all_formats(tmp_path: Path, suffix: str, projection: str) -> None:
-    path = _save(tmp_path / f"image{suffix}", GPANO_TAGS | {"ProjectionType": projection})
+    path = save_tagged(tmp_path / f"image{suffix}", GPANO_TAGS | {"ProjectionType": projection})
     assert read_area(path, (40, 60)) == _AREA
 
 
@@ -144,6 +134,8 @@ def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
     path.write_bytes(_jpeg(_adobe(packet)))
     with pytest.raises(DataError, match=r"image\.jpg: found XMP data that .*exiftool"):
         read_up(path)
+    with pytest.raises(DataError, match="XMP data"):  # it may say that the picture is stereo
+        read_panorama(path, (-30, 30, -20, 20))
     old, new = (name.encode("utf-16-le") for name in ("photos", "videos"))
     other = packet.replace(b"photos", b"videos").replace(old, new)
     path.write_bytes(_jpeg(_adobe(other)))
@@ -153,9 +145,13 @@ def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
 def test_images_that_say_nothing(tmp_path: Path) -> None:
     Image.new("RGB", (60, 40)).save(tmp_path / "none.jpg")
     incomplete = {k: v for k, v in GPANO_TAGS.items() if k != "CroppedAreaTopPixels"}
-    other = _save(tmp_path / "other.jpg", GPANO_TAGS)
+    other = save_tagged(tmp_path / "other.jpg", GPANO_TAGS)
     other.write_bytes(other.read_bytes().replace(b"photos/1.0/panorama", b"photos/1.0/image"))
-    for path in (tmp_path / "none.jpg", _save(tmp_path / "incomplete.jpg", incomplete), other):
+    for path in (
+        tmp_path / "none.jpg",
+        save_tagged(tmp_path / "incomplete.jpg", incomplete),
+        other,
+    ):
         assert read_area(path, (30, 60)) == read_area(Path("image"), (30, 60)), path.name
         with pytest.raises(DataError, match="a whole panorama"):
             read_area(path, (40, 60))
@@ -164,7 +160,7 @@ def test_images_that_say_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [(20, 30), (80, 120), (27, 40), (33, 50)])
 def test_resized_images_show_the_same(tmp_path: Path, size: tuple[int, int]) -> None:
-    path = _save(tmp_path / "image.jpg", GPANO_TAGS, size)
+    path = save_tagged(tmp_path / "image.jpg", GPANO_TAGS, size)
     area = read_area(path, size)
     assert area is not None
     assert area.image_shape == size
@@ -182,8 +178,8 @@ def test_a_left_edge_before_the_panorama_is_near_its_right_edge(tmp_path: Path) 
     left = int(GPANO_TAGS["CroppedAreaLeftPixels"])
     turn = int(GPANO_TAGS["FullPanoWidthPixels"])
     tags = GPANO_TAGS | {"CroppedAreaLeftPixels": str(left - turn)}
-    area = read_area(_save(tmp_path / "before.jpg", tags), (40, 60))
-    assert area == read_area(_save(tmp_path / "image.jpg", GPANO_TAGS), (40, 60))
+    area = read_area(save_tagged(tmp_path / "before.jpg", tags), (40, 60))
+    assert area == read_area(save_tagged(tmp_path / "image.jpg", GPANO_TAGS), (40, 60))
 
 
 def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.float64]:
@@ -207,7 +203,7 @@ def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.fl
 def test_tags_that_cannot_be_are_refused(
     tmp_path: Path, changes: dict[str, str], size: tuple[int, int], found: str
 ) -> None:
-    path = _save(tmp_path / "image.jpg", GPANO_TAGS | changes)
+    path = save_tagged(tmp_path / "image.jpg", GPANO_TAGS | changes)
     with pytest.raises(DataError, match=rf"image\.jpg: found .*{found}"):
         read_area(path, size)
 
@@ -299,7 +295,7 @@ def test_pixels_that_are_not_square_are_refused() -> None:
 def test_zero_pitch_and_roll_are_unknown(tmp_path: Path, pitch: str, roll: str) -> None:
     """Programs write zero pitch and roll by default."""
     tags = {"PosePitchDegrees": pitch, "PoseRollDegrees": roll}
-    up = read_up(_save(tmp_path / "image.jpg", tags))
+    up = read_up(save_tagged(tmp_path / "image.jpg", tags))
     expected = None if float(pitch) == 0 else up_from_pose(float(pitch), float(roll))
     np.testing.assert_array_equal(up, expected)
 
@@ -307,7 +303,7 @@ def test_zero_pitch_and_roll_are_unknown(tmp_path: Path, pitch: str, roll: str) 
 @pytest.mark.parametrize("value", ["181", "nan", "steep", "1e400"])
 @pytest.mark.parametrize("axis", ["Pitch", "Roll"])
 def test_impossible_poses_are_refused(tmp_path: Path, axis: str, value: str) -> None:
-    path = _save(tmp_path / "image.jpg", {f"Pose{axis}Degrees": value})
+    path = save_tagged(tmp_path / "image.jpg", {f"Pose{axis}Degrees": value})
     with pytest.raises(DataError, match=r"image\.jpg: found GPano:Pose.*expected numbers from"):
         read_up(path)
 

@@ -256,6 +256,9 @@ _PART = dict(zip(PART_TAGS, ("2", "1", "0.75", "0.75", "0.25", "0.25"), strict=T
         (stereo_box(0), {}),
         (stereo_box(1), {"StereoMode": "top-bottom"}),
         (stereo_box(2) + _TILE, {"StereoMode": "left-right"} | _POSE | _PART),
+        (stereo_box(4), {"StereoMode": "right-left"}),
+        (stereo_box(3), "stereo of mode 3"),
+        (projection_boxes(b"mshp"), "a mesh projection"),
         (projection_boxes(b"cbmp"), "a cube map"),
     ],
 )

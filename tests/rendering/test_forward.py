@@ -19,7 +19,13 @@ from tangent_train.geometry import (
     random_rotation,
     xyz_to_lonlat,
 )
-from tangent_train.rendering import equirect_to_tangent, forward, perspective, tables
+from tangent_train.rendering import (
+    equirect_to_tangent,
+    forward,
+    perspective,
+    tables,
+    tangent_to_equirect,
+)
 from tangent_train.rendering.resampling import reduce_to_pitch, resize
 from tests.rendering.reference import sample_panorama
 
@@ -257,3 +263,15 @@ def test_tracing_is_refused() -> None:
     grid, trace = TangentGrid(0, 3), cast("Any", torch.jit.trace)
     with pytest.raises(SettingError, match=r"torch\.compile"):
         trace(lambda image: equirect_to_tangent(image, grid), torch.rand(3, 16, 32))
+
+
+def test_tables_of_an_evaluation_serve_a_training() -> None:
+    """Lightning evaluates in inference mode, whose tensors have no gradients."""
+    grid = TangentGrid(0, 3)
+    with torch.inference_mode():
+        images = equirect_to_tangent(torch.rand(1, 14, 28).double(), grid)
+        tangent_to_equirect(images, grid, (14, 28), "feather")
+    panorama = torch.rand(1, 14, 28).double().requires_grad_()
+    images = equirect_to_tangent(panorama, grid)
+    total = tangent_to_equirect(images, grid, (14, 28), "feather").sum()
+    assert torch.autograd.grad(total, panorama)[0].sum() == pytest.approx(14 * 28)

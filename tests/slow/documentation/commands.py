@@ -139,7 +139,9 @@ def fill_in(words: list[str], world: Path) -> list[str]:
         filled = [re.sub("runs/(demo|student)", "runs/rgb", word) for word in filled]
     if "data=stanford2d3ds_pairs" in filled:
         filled = [word.replace("data/2d3ds", "data/pairs") for word in filled]
-    return [program, *(word for word in filled if word != "-m" or not is_sweep)]
+    if is_sweep:
+        filled = [word for word in filled if not word.startswith(("-m", "sweep=", "launcher="))]
+    return [program, *filled]
 
 
 def small_settings(words: list[str], world: Path) -> list[str]:
