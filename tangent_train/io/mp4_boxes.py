@@ -34,7 +34,7 @@ def spherical_boxes(path: Path) -> tuple[str | None, bool]:
 
 
 def _moov(path: Path) -> bytes:
-    """Return the content of the box ``moov``; empty if the file has none."""
+    """Return the content of the box ``moov``, or no bytes."""
     with path.open("rb") as file:
         while len(header := file.read(8)) == 8:
             size, name = struct.unpack(">I4s", header)
