@@ -170,17 +170,14 @@ class TorchSums:
         self._values = self._labels
         matrix = _Matrix(views, self._shape, size, values, self._is_feathered)
         if not self._averaged:
-            parts = matrix.parts(
-                math.ceil(values.shape[1] * math.prod(self._shape) / _SCORES_AT_ONCE)
-            )
-            best = [self._best(matrix.sums(values, part)) for part in parts]
-            self._labels = _joined(best)
+            count = math.ceil(self._channels * math.prod(self._shape) / _SCORES_AT_ONCE)
+            best = (self._best(matrix.sums(values, part)) for part in matrix.parts(count))
+            self._labels = _joined(list(best))
             return
         sums = _joined([matrix.sums(values, part) for part in matrix.parts()])
         if self._softmax and not self._is_feathered:
-            sums = sums.masked_fill(sums.amax(dim=-1, keepdim=True) < -_LARGEST, math.nan).softmax(
-                -1
-            )
+            are_lost = sums.amax(dim=-1, keepdim=True) < -_LARGEST  # all are minus infinity
+            sums = sums.masked_fill(are_lost, math.nan).softmax(-1)
         self._sums = sums if self._sums is None else self._sums + sums
 
     def _best(self, scores: Tensor, min_confidence: float = 0.0) -> Tensor:
