@@ -231,14 +231,13 @@ class TangentResults:
         Raises:
             SettingError: The format cannot hold the pixels, or `z_depth` is set without depth.
         """
-        suffix, channels = path.suffix.lower(), self.arrays[0].shape[2:]
+        suffix = path.suffix.lower()
         is_lossy = suffix in pixel_files.LOSSY_SUFFIXES and self.kind != "color"
         if is_lossy or (z_depth and self.kind != "depth"):
             setting = "output" if is_lossy else "z_depth"
             expected = "depth with z_depth=true, and png, tif or npy for all but colors"
             raise SettingError(setting, found=f"{self.kind} to {path.name}", expected=expected)
         dtype = self._image_dtype() if suffix != ".npy" else self.arrays[0].dtype
-        pixel_files.check_writable(suffix, dtype, channels[0] if channels else 1)
         arrays = [_distances(array, self.grid) for array in self.arrays] if z_depth else self.arrays
         interpolation: Interpolation = "bilinear"
         if self.kind in ("labels", "depth"):
