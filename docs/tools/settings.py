@@ -35,9 +35,9 @@ GROUPS = {
 
 _PAGE_OF = {group: page for page, groups in GROUPS.items() for group in groups}
 _HEADS = {
-    "data": "# Settings of data sets\n",
-    "networks": "# Settings of views and networks\n\nThe data set `network.in_channels` and "
-    "`network.num_classes`, which are not listed.\n",
+    "data": "# Settings of data sets\n\n[Data sets](../data_sets.md) lists content and files.\n",
+    "networks": "# Settings of views and networks\n\n`network.in_channels` and "
+    "`network.num_classes` follow from the data and are not listed.\n",
     "runs": "# Settings of runs\n",
 }
 _COMMON = 0.4
@@ -135,7 +135,7 @@ def _group(name: str) -> str:
     ]
     described: dict[tuple[str, str], tuple[str, str]] = {}
     parts = [f"## {name}\n"]
-    parts += [f"Settings of most options:\n\n{_list(common, _prefix(files[0]))}"] if common else []
+    parts += [f"Common settings:\n\n{_list(common, _prefix(files[0]))}"] if common else []
     return "\n".join([*parts, *(_option(file, listed, common, described) for file in files)])
 
 
@@ -162,7 +162,9 @@ def _option(
             described[key] = file.stem, one.value
     with_changes = f", with {_listed(changes)}" if changes else ""
     based = f"Based on {_listed(f'{group}={base.stem}' for base in bases_)}{with_changes}."
-    notes = [based] if bases_ else _of_common({one.name for one in listed[file]}, common, changes)
+    names = {one.name for one in listed[file]}
+    other = [one for one in common if one.name not in {setting.name for setting in own}]
+    notes = [based] if bases_ else _of_common(names, other, changes)
     notes += _as_in(seen, f"{group}=")
     rows = _list(own, _prefix(file)).rstrip()
     parts = [f"### {group}={file.stem}", _prose(file), " ".join(notes), rows]
@@ -177,9 +179,9 @@ def _of_common(
     has = [changed.get(one.name, one.name) for one in common if one.name in names]
     lacks = [one.name for one in common if one.name not in names]
     if len(lacks) > len(has):
-        return [f"Of the settings above: {_listed(has) or 'none'}."]
+        return [f"Of the common settings: {_listed(has)}."] if has else ["No common settings."]
     notes = [f"Other defaults: {_listed(changed.values())}."] if changed else []
-    return [*notes, f"Not here: {_listed(lacks)}."] if lacks else notes
+    return [*notes, f"Without {_listed(lacks)}."] if lacks else notes
 
 
 def _own_bases(file: Path) -> list[Path]:
