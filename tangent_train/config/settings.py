@@ -106,7 +106,7 @@ class ImageSettings(Settings):
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """Settings of tangent-predict."""
 
-    not_content = ("output", "report", "shard", "view_batch_size", "device", "trust")
+    not_content = ("output", "report", "shard", "view_batch_size", "compile", "device", "trust")
 
     input: str | Path
     """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
@@ -169,6 +169,9 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """part of the images for this process, e.g. 3/16; null = all"""
     view_batch_size: PositiveInt | None = None
     """views per forward pass; null = as many as have 2^20 pixels"""
+    compile: dict[str, Any] | None = None
+    """arguments of torch.compile, e.g. {mode: reduce-overhead} for CUDA graphs; {} = its defaults;
+    null = do not compile"""
     device: str = "auto"
     """auto | cpu | cuda | cuda:1 | mps"""
 
