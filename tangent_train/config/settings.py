@@ -305,13 +305,12 @@ class ImportSettings(Settings):
         """Refuse settings that name no trained network."""
         is_own = values.get("network") is not None
         if values.get("library") is None and not (is_own and values.get("weights")):
-            options = sorted(path.stem for path in (config_folder() / "network").glob("*.yaml"))
             raise SettingError(
                 "weights" if is_own else "library",
                 found="null",
-                expected="a trained network, which tangent-import writes as a checkpoint: library="
-                "torchvision, huggingface, smp or onnx; or network= with weights=<its file>",
-                remedy=f"Options of network=: {', '.join(options)}. To train one: tangent-train.",
+                expected="a trained network: library=torchvision, huggingface, smp or onnx; or "
+                "network= with weights=<its file>",
+                remedy=f"Example: {_example('import')}",
             )
         return values
 
@@ -584,24 +583,45 @@ def plain(value: Any) -> Any:
     return [plain(one) for one in value] if isinstance(value, tuple) else value
 
 
-def validate(command: str, config: Any) -> Any:
+def validate(command: str, config: Any, needed: Collection[str] = ()) -> Any:
     """Return the settings of a command as an object of its class.
 
     Args:
         command: Name of the command, e.g. predict.
         config: Settings that Hydra has composed, or a mapping of them.
+        needed: Groups that have to be typed, although they have a default.
 
     Raises:
         SettingError: A setting is missing, unknown, or of another type.
     """
     values: Any = OmegaConf.to_container(OmegaConf.create(config), resolve=True)
     kind = SETTINGS[command]
+    given = {name: v for name, v in values.items() if v != "???" and name not in needed}
     try:
-        return kind.model_validate({name: v for name, v in values.items() if v != "???"})
+        return kind.model_validate(given)
     except ValidationError as error:
-        known = {name: comment_of(field) for name, field in kind.model_fields.items()}
-        inner = [one for one in dotted_names(values) if not is_within(one, kind.not_read)]
-        raise wrong_setting(error, dict.fromkeys(inner, "a value") | known) from error
+        kinds = {".".join(map(str, one["loc"])): one["type"] for one in error.errors()}
+        missing = [f"{name}=" for name, wrong in kinds.items() if wrong == "missing"]
+        if missing and "extra_forbidden" not in kinds.values():  # it may be meant for a missing one
+            text = ", ".join(missing).replace("data=", "data= or experiment=")
+            raise SettingError(f"Missing: {text}. Example: {_example(command)}") from error
+        known = [one for one in dotted_names(values) if not is_within(one, kind.not_read)]
+        raise wrong_setting(error, known) from error
+
+
+def _example(command: str) -> str:
+    """Return the first example in the help of a command."""
+    text = (config_folder() / f"{command}.yaml").read_text("utf-8")
+    found = re.search(rf"^ +(tangent-{command} .*?)(  |$)", text, re.MULTILINE)
+    return found[1] if found else f"tangent-{command} --help"
+
+
+def missing_groups(command: str) -> list[str]:
+    """Return ["data"] if the command line of a run chooses no data set, neither by experiment."""
+    is_own = HydraConfig.get().job.config_name == command  # not that of a resumed run or a stage
+    chosen = any(is_within(name, ("data", "experiment")) for name in typed_names())
+    needs_data = issubclass(SETTINGS[command], RunSettings) and is_own and not chosen
+    return ["data"] * needs_data
 
 
 def typed_settings() -> list[str]:
@@ -617,7 +637,7 @@ def typed_names() -> list[str]:
 
 def is_within(name: str, names: Collection[str]) -> bool:
     """Return True for one of the names, regular expressions, and for a setting of such a group."""
-    return any(re.match(rf"{one}([.@]|$)", name) for one in names)
+    return any(re.match(rf"{one}([.@/]|$)", name) for one in names)
 
 
 def dotted_names(section: Any, prefix: str = "") -> Iterator[str]:

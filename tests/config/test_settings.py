@@ -71,7 +71,7 @@ def test_a_recipe_sets_what_the_task_has(task: str) -> None:
         ("train", ["seed=abc"], r"^seed: found abc; expected a valid integer"),
         ("train", ["+sed=1"], r"^sed: found 1; expected a known setting\. Did you mean seed\?"),
         ("export", ["checkpoint=none.ckpt", "output=x"], r"^checkpoint: found none\.ckpt; .*exist"),
-        ("export", [f"checkpoint={CONFIGS}"], r"^output: found nothing; expected file: \.onnx"),
+        ("export", [f"checkpoint={CONFIGS}"], "^Missing: output=. Example: tangent-export checkp"),
         ("train", ["level=20"], r"^level: found 20; .*less than or equal to 14"),
         ("predict", [*GIVEN["predict"], "levels=[9,20]"], "^levels: found 20; .*equal to 14"),
         ("keypoints", ["output=x", "pairing=some"], "^pairing: .*'consecutive' or 'all'"),
@@ -138,7 +138,7 @@ def test_settings_of_one_name_are_explained_apart() -> None:
         ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "levl=5", "Did you mean level?"),
         ("train", "resume=nowhere", "nowhere: found no config.yaml"),
-        ("export", "output=x.onnx", "checkpoint: found nothing; expected network"),
+        ("export", "output=x.onnx", "tangent-export: Missing: checkpoint=. Example: "),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
     ],
 )
