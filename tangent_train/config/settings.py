@@ -1,7 +1,8 @@
 """Settings of the commands: name, type, default and comment, once.
 
 A class gives Hydra the defaults (`config_name`), validates the composed settings (`validate`),
-and feeds ``--help`` and the reference page with its comments. Options of groups (``data=…``) are
+and feeds ``--help`` and the reference page with its comments. Lines ``# --- … ---`` are headings in
+``--help``. Options of groups (``data=…``) are
 YAML files; their types are those of the class that they build.
 """
 
@@ -73,6 +74,7 @@ class Settings(BaseModel):
 class NetworkSettings(Settings):
     """Settings of commands that load a network from a file."""
 
+    # --- network ---
     checkpoint: ExistingPath
     """network, written by tangent-train, tangent-import or tangent-export"""
     trust: OneOrMore[str] = ()
@@ -82,6 +84,7 @@ class NetworkSettings(Settings):
 class LabelMapSettings(Settings):
     """Settings of commands that map the classes of a network."""
 
+    # --- classes ---
     label_map: str | Path | None = None
     """maps the classes of the network to those of another data set: ade20k_to_stanford2d3ds, …, or
     a JSON file; null = same classes"""
@@ -93,6 +96,7 @@ class LabelMapSettings(Settings):
 class ImageSettings(Settings):
     """Settings of commands that read images and videos."""
 
+    # --- input ---
     every: PositiveInt = 1
     """videos: use the first and then every n-th frame"""
     area: tuple[float, float, float, float] | None = None
@@ -107,10 +111,13 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 
     not_content = ("output", "report", "shard", "view_batch_size", "device", "trust")
 
+    # --- input ---
     input: str | Path
     """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
-    output: Path
-    """folder for the results"""
+    projection: Literal["equirectangular", "perspective"] = "equirectangular"
+    """equirectangular | perspective (photos)"""
+    fov: FieldOfView | None = None
+    """photos: horizontal field of view in degrees; null = from EXIF"""
     depth: ExistingPath | None = None
     """folder of depth images with the names of the inputs, for networks with depth"""
     depth_scale: PositiveFloat = 1000
@@ -118,13 +125,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     depth_channel: str | None = None
     """OpenEXR files: channel of depth, e.g. ViewLayer.Depth.Z; null = the one called Z, depth,
     depth.Z or depth.V"""
-    projection: Literal["equirectangular", "perspective"] = "equirectangular"
-    """equirectangular | perspective (photos)"""
-    fill: Literal["black", "mean", "edge", "reflect"] | None = None
-    """colors outside the area, in views that leave it: black | mean (color) | edge (nearest pixel)
-    | reflect; null: as trained"""
-    fov: FieldOfView | None = None
-    """photos: horizontal field of view in degrees; null = from EXIF"""
+
+    # --- views ---
     views: Views = None
     """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy | erp |
     erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null = those of
@@ -134,6 +136,9 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     checkpoint"""
     base_level: int | None = None
     """base level b: 20·4^b images; null = that of the checkpoint, 0 for imported networks"""
+    fill: Literal["black", "mean", "edge", "reflect"] | None = None
+    """colors outside the area, in views that leave it: black | mean (color) | edge (nearest pixel)
+    | reflect; null: as trained"""
     blend: Blend = "feather"
     """joins overlapping images: feather (weighted mean) | nearest"""
     rotations: PositiveInt = 1
@@ -142,6 +147,16 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """align with gravity: pose (tags of the file) | auto (the same, else estimated); null = off"""
     max_tilt_deg: Annotated[float, Field(gt=0, le=180)] = 60
     """upright=auto: largest tilt to consider, in degrees"""
+    align: Align | None = None
+    """depth: brings the views to one scale: none | scale | affine | grid (scales that vary within a
+    view); null: by the network's kind of depth"""
+
+    # --- output ---
+    output: Path
+    """folder for the results"""
+    write: OneOrMore[str] | None = None
+    """files to write: labels, color, overlay, probabilities (float16), or depth, color, points
+    (PLY); null = all but the last of either; color and overlay of a video are videos"""
     mask: float | ExistingPath | None = None
     """panoramas: pixels that become unknown (0): a latitude (-60: below it), a PNG file (black) or
     a folder of them; null = none"""
@@ -150,18 +165,14 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     min_share: Share = 0
     """keep at least this share of each class's pixels, the most confident, below min_confidence
     too; found on up to 32 images"""
-    align: Align | None = None
-    """depth: brings the views to one scale: none | scale | affine | grid (scales that vary within a
-    view); null: by the network's kind of depth"""
     depth_format: Literal["png", "npy", "exr"] | None = None
     """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
     points: PositiveInt | None = None
     """depth, write=[points]: points of an image, at most; null = 500000"""
-    write: OneOrMore[str] | None = None
-    """files to write: labels, color, overlay, probabilities (float16), or depth, color, points
-    (PLY); null = all but the last of either; color and overlay of a video are videos"""
     report: NonNegativeInt = 12
     """images to show in report.html; 0 = no report"""
+
+    # --- performance ---
     shard: str | int | None = None
     """part of the images to predict, e.g. 3/16, for several machines; null = all"""
     view_batch_size: PositiveInt | None = None
@@ -175,12 +186,17 @@ class RenderSettings(ImageSettings):
 
     not_content = ("figure", "output", "overwrite")
 
+    # --- input ---
     input: str | Path | None = None
-    """panorama or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
-    output: Path | None = None
-    """folder for the tangent images; with back=, the file of the panorama"""
-    overwrite: bool = False
-    """true: replace an existing file (of figure=, poses=, or back= of one panorama)"""
+    """required without back= or poses=: panorama or video, folder of them, or pattern, e.g.
+    'holiday/*.jpg'"""
+    depth_channel: str | None = None
+    """OpenEXR files: channel to read, e.g. ViewLayer.Depth.Z; null = colors, or for nearest and
+    depth the one called Z, depth, depth.Z or depth.V"""
+    interpolation: Literal["bilinear", "nearest"] = "bilinear"
+    """bilinear | nearest (for labels and depth)"""
+
+    # --- views ---
     views: Views = None
     """views: tangent | horizontal | horizontal_economy | horizontal_wide | cubemap, or
     'views={option: horizontal, fov: 110}'; null = tangent"""
@@ -191,6 +207,12 @@ class RenderSettings(ImageSettings):
     dim: int | None = None
     """tangent images: side in pixels; smaller crops them, larger adds a margin; null = 2^(s−b).
     Other views: see views"""
+    faces: OneOrMore[int] | None = None
+    """indices of the images to write, e.g. [0,5]; null = all"""
+    rotation: tuple[float, float, float] | None = None
+    """rotation of the views as a whole: [yaw,pitch,roll] in degrees; null = none"""
+
+    # --- views in given directions ---
     yaw: OneOrMore[float] | None = None
     """views in these directions instead of tangent images: degrees to the right of the middle, e.g.
     [0,90,180,270]; null = 0"""
@@ -202,17 +224,18 @@ class RenderSettings(ImageSettings):
     """horizontal field of view of these views in degrees, or [horizontal, vertical]; null = 90"""
     size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = None
     """size of these views in pixels: [width, height], or one number; null = by level and fov"""
-    faces: OneOrMore[int] | None = None
-    """indices of the images to write, e.g. [0,5]; null = all"""
-    rotation: tuple[float, float, float] | None = None
-    """rotation of the views as a whole: [yaw,pitch,roll] in degrees; null = none"""
+
+    # --- output ---
+    output: Path | None = None
+    """folder for the tangent images; with back=, the file of the panorama"""
+    overwrite: bool = False
+    """true: replace an existing file (of figure=, poses=, or back= of one panorama)"""
     format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
-    interpolation: Literal["bilinear", "nearest"] = "bilinear"
-    """bilinear | nearest (for labels and depth)"""
-    depth_channel: str | None = None
-    """OpenEXR files: channel to read, e.g. ViewLayer.Depth.Z; null = colors, or for nearest and
-    depth the one called Z, depth, depth.Z or depth.V"""
+    figure: Path | None = None
+    """PNG file of the first panorama and its tangent images; output is then optional"""
+
+    # --- COLMAP ---
     colmap: bool = False
     """true: one project for COLMAP of all panoramas: images, masks and rig_config.json"""
     mask: float | ExistingPath | None = None
@@ -220,12 +243,12 @@ class RenderSettings(ImageSettings):
     them; null = none"""
     mask_classes: OneOrMore[str] | None = None
     """classes to ignore, e.g. [person]; mask is then a folder with labels/ and classes.json"""
-    figure: Path | None = None
-    """PNG file of the first panorama and its tangent images; output is then optional"""
-    back: ExistingPath | None = None
-    """folder of results on the tangent images of one panorama, or a folder of such folders"""
     poses: ExistingPath | None = None
     """sparse model of COLMAP; the poses of its panoramas are written as JSON"""
+
+    # --- back to panoramas ---
+    back: ExistingPath | None = None
+    """folder of results on the tangent images of one panorama, or a folder of such folders"""
     cameras: ExistingPath | None = None
     """back=: cameras.json or its folder; null = with the results. poses=: the project; null = two
     folders up"""
@@ -243,21 +266,23 @@ class RenderSettings(ImageSettings):
 class ExportSettings(NetworkSettings):
     """Settings of tangent-export."""
 
+    # --- output ---
     output: Path
     """file: .onnx or .safetensors"""
+    overwrite: bool = False
+    """true: replace an existing file"""
     image_size: tuple[int, int] | None = None
     """fixed size of the images: [height, width]; null = any size that the network accepts"""
     opset: int | None = None
     """ONNX operator set; null = default of the exporter"""
-    overwrite: bool = False
-    """true: replace an existing file"""
 
 
 class ImportSettings(Settings):
     """Settings of tangent-import."""
 
+    # --- network ---
     library: Literal["torchvision", "huggingface", "smp", "onnx"] | None = None
-    """torchvision | huggingface | smp | onnx; null for an option of the group network"""
+    """required without network=: torchvision | huggingface | smp | onnx"""
     network: Section | None = None
     """an option of configs/network, with weights of your own"""
     model: str | Path | None = None
@@ -266,14 +291,6 @@ class ImportSettings(Settings):
     """torchvision: DEFAULT, another name, or a file; options of configs/network: a state dict"""
     file: ExistingPath | None = None
     """library=onnx: the ONNX file"""
-    classes: ExistingPath | None = None
-    """JSON list of class names in the order of the scores; null = from the model"""
-    normalization: str | dict[str, tuple[float, ...]] | None = None
-    """imagenet | unit | symmetric | {mean: […], std: […]}; null = from the model"""
-    unknown_classes: OneOrMore[str] = ()
-    """classes whose pixels are unknown, e.g. [background]"""
-    unknown_wins: bool = True
-    """pixels where such a class wins: true: unknown (label 0) | false: the best other class"""
     scores: ScoreKind | None = None
     """output of the network: logits | probabilities | labels; null = by the sums of its values
     (onnx)"""
@@ -283,6 +300,20 @@ class ImportSettings(Settings):
     or it predicts classes"""
     image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
     """fixed size of the images: [rows,columns] or the side; null = from the model"""
+
+    # --- classes ---
+    classes: ExistingPath | None = None
+    """JSON list of class names in the order of the scores; null = from the model"""
+    unknown_classes: OneOrMore[str] = ()
+    """classes whose pixels are unknown, e.g. [background]"""
+    unknown_wins: bool = True
+    """pixels where such a class wins: true: unknown (label 0) | false: the best other class"""
+
+    # --- photos and views ---
+    normalization: str | dict[str, tuple[float, ...]] | None = None
+    """imagenet | unit | symmetric | {mean: […], std: […]}; null = from the model"""
+    fov: FieldOfView = 60
+    """horizontal field of view of its photos in degrees; predictions on photos use it"""
     views: Views = None
     """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |
     erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null =
@@ -292,8 +323,8 @@ class ImportSettings(Settings):
     tangent images two, e.g. [9, 8]"""
     base_level: int | None = None
     """base level b: 20·4^b tangent images; null = the fewest, 0 for wide ones"""
-    fov: FieldOfView = 60
-    """horizontal field of view of its photos in degrees; predictions on photos use it"""
+
+    # --- output ---
     output: Path
     """file to write: .ckpt, or .onnx for library=onnx"""
     overwrite: bool = False
@@ -318,11 +349,10 @@ class ImportSettings(Settings):
 class KeypointSettings(Settings):
     """Settings of tangent-keypoints."""
 
+    # --- input ---
     data: Section | None = None
     """pairs of a data set: synthrooms_pairs | stanford2d3ds_pairs | zind_pairs; unused with left=
     or input="""
-    output: Path
-    """folder for the results; with the same settings, interrupted results are continued"""
     left: ExistingPath | None = None
     """first panorama of a pair of your own, with right="""
     right: ExistingPath | None = None
@@ -331,12 +361,18 @@ class KeypointSettings(Settings):
     """folder of your panoramas, or pattern, e.g. 'holiday/*.jpg'"""
     pairing: Literal["consecutive", "all"] = "consecutive"
     """pairs from input: consecutive (each panorama with the next) | all"""
+    max_pairs: PositiveInt | None = None
+    """compare the first pairs only; null = all"""
+
+    # --- views ---
     base_level: OneOrMore[int] = (0, 1, 2)
     """base levels b to compare, e.g. 1 or [0,1]: 20·4^b images each"""
     level: Level | None = None
     """level s, the angular resolution, at most that of the panorama; null = from its rows"""
     margin: NonNegativeInt = 32
     """pixels added around tangent images, so that keypoints at borders are found"""
+
+    # --- matching ---
     ratio: PositiveFloat = 0.8
     """ratio test: largest distance to the nearest neighbor over that to the second nearest; 1 =
     off"""
@@ -344,13 +380,15 @@ class KeypointSettings(Settings):
     """true: mutual nearest neighbors only"""
     max_error_deg: PositiveFloat = 1
     """largest error of inliers of the two-view geometry, in degrees"""
-    seed: NonNegativeInt = 0
-    """seed of random samples and rotations"""
     controls: bool = True
     """true: also the panorama at the resolution of the tangent images, a cube map, and the right
     panorama rotated"""
-    max_pairs: PositiveInt | None = None
-    """compare the first pairs only; null = all"""
+    seed: NonNegativeInt = 0
+    """seed of random samples and rotations"""
+
+    # --- output ---
+    output: Path
+    """folder for the results; with the same settings, interrupted results are continued"""
     pictures: NonNegativeInt = 2
     """pairs whose matches are drawn"""
     export: bool = False
@@ -360,12 +398,30 @@ class KeypointSettings(Settings):
 class RunSettings(Settings):
     """Settings of a run, which experiments may set."""
 
+    # --- run ---
+    name: str = "run"
+    """first folder below runs/"""
+    seed: NonNegativeInt = 0
+    """seed of initial weights, order, images and augmentation"""
+
+    # --- data ---
     data: Section
-    """data set"""
+    """data set; required, unless experiment= chooses it"""
+
+    # --- views ---
+    level: Level = 5
+    """level s, the angular resolution: panoramas of 2^(s+1) rows"""
     representation: Section
     """views of a panorama that the network is given"""
+
+    # --- network ---
     network: Section | None = None
     """network that is trained"""
+
+    # --- training ---
+    ema: Share | None = None
+    """decay of the average of the weights, e.g. 0.999; the average is evaluated and stored; null =
+    off"""
     task: Section
     """segmentation | classification | depth"""
     optimizer: Section | None = None
@@ -374,35 +430,31 @@ class RunSettings(Settings):
     """schedule of the learning rate"""
     trainer: Section
     """default | ddp (several processes)"""
-    logger: Section | None = None
-    """csv | tensorboard | wandb | mlflow | many | none"""
     callbacks: Section | None = None
     """early_stopping | model_summary; null = none"""
-    name: str = "run"
-    """first folder below runs/"""
-    seed: NonNegativeInt = 0
-    """seed of initial weights, order, images and augmentation"""
-    level: Level = 5
-    """level s, the angular resolution: panoramas of 2^(s+1) rows"""
+
+    # --- output ---
     panels: NonNegativeInt = 6
     """test images drawn as panels and shown in report.html (segmentation and depth)"""
     validation_images: NonNegativeInt = 4
     """validation images shown by loggers that can show images (segmentation and depth)"""
     checkpoint_every_n_steps: PositiveInt | None = 500
     """training steps between checkpoints, besides those of every epoch; null = every epoch only"""
-    ema: Share | None = None
-    """decay of the average of the weights, e.g. 0.999; the average is evaluated and stored; null =
-    off"""
+    logger: Section | None = None
+    """csv | tensorboard | wandb | mlflow | many | none"""
 
 
 class TrainSettings(RunSettings):
     """Settings of tangent-train."""
 
+    # --- run ---
+    resume: Path | None = None
+    """folder of an interrupted run, which is continued with its settings"""
+
+    # --- network ---
     init_from: Path | None = None
     """fine-tuning: checkpoint, state dict or safetensors that the network starts from; null = new
     weights"""
-    resume: Path | None = None
-    """folder of an interrupted run, which is continued with its settings"""
     trust: OneOrMore[str] = ()
     """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
 
@@ -429,6 +481,7 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
 class PrepareSettings(RunSettings):
     """Settings of tangent-prepare."""
 
+    # --- performance ---
     shard: str | int | None = None
     """part of the cache to fill, e.g. 3/16, for several machines; null = all"""
 
@@ -463,32 +516,43 @@ class FineTuningSettings(Settings):
 class TransferSettings(LabelMapSettings, RunSettings):
     """Settings of tangent-transfer."""
 
+    # --- run ---
     name: str = "transfer"
     """folder below runs/transfer; the same name continues an interrupted transfer"""
-    level: Level = 8
-    """level s of the panoramas and of the crops of photos"""
     seeds: OneOrMore[int] | None = None
     """one transfer per seed, e.g. [0, 1, 2]; null = seed"""
     folds: OneOrMore[int] | None = None
     """one transfer per fold, e.g. [1, 2, 3]; null = data.fold, or no folds"""
+
+    # --- photos ---
+    photos: PhotoSettings
+    """the photos"""
+
+    # --- views ---
+    level: Level = 8
+    """level s of the panoramas and of the crops of photos"""
+
+    # --- network ---
     checkpoint: ExistingPath | None = None
     """network trained on photos (P), which is evaluated and fine-tuned; null = train it"""
     trust: OneOrMore[str] = ()
     """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+
+    # --- training ---
+    fine_tuning: FineTuningSettings
+    """fine-tuning of P on photos (P-FT) and on panoramas (S-FT)"""
+
+    # --- evaluation ---
     compare: OneOrMore[str | Section] = ("erp", "cubemap")
     """further views to evaluate P on: names of representations, or settings, e.g. {name: fine,
     option: erp, rows: 1024}"""
     conditions: OneOrMore[str | Section] = ("upright",)
     """test conditions: upright, or settings of data, e.g. {name: tilted-45, test_rotation: 45,
     upright: auto}"""
-    fine_tuning: FineTuningSettings
-    """fine-tuning of P on photos (P-FT) and on panoramas (S-FT)"""
     study_levels: OneOrMore[Level] | None = None
     """evaluate P only, on panoramas of these levels, e.g. [5, 6, 7, 8, 9, 10]; null = off"""
     study_max_rows: Rows = 512
     """rows of the stored panoramas; finer levels are rendered from them"""
-    photos: PhotoSettings
-    """the photos"""
 
 
 SETTINGS: Mapping[str, type[Settings]] = {
