@@ -108,10 +108,17 @@ def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
     alternatives = [
         Alternative("the network", lambda: scores(lambda part: random[: part.stop - part.start]))
     ]
-    for blend in ("feather", "nearest"):
-        views = ViewSelector(trained, blend=blend)
-        call = partial(predicted, Predictor(trained, head_of(trained), views, DEVICE.type))
-        alternatives.append(Alternative(f"Predictor, {blend}", call, is_ours=True))
+    compilers: dict[str, Any] = {
+        "feather": None,
+        "nearest": None,
+        "nearest, CUDA graphs": {"mode": "reduce-overhead"},
+    }
+    for name, compiler in compilers.items():
+        views = ViewSelector(trained, blend=name.partition(",")[0])
+        predictor = Predictor(trained, head_of(trained), views, DEVICE.type, compile=compiler)
+        if compiler is None or ON_GPU:
+            call = partial(predicted, predictor)
+            alternatives.append(Alternative(f"Predictor, {name}", call, is_ours=True))
     with torch.autocast(DEVICE.type, torch.bfloat16, enabled=DEVICE.type == "cuda"):
         return measure(alternatives, rounds)
 

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from itertools import chain
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 from tangent_train.config.help import (
     Setting,
@@ -25,15 +23,8 @@ from tangent_train.results.published import facts, protocols
 
 CONFIGS = config_folder()
 REFERENCE = Path(__file__).parents[1] / "reference"
-COMMANDS = {
-    "train": ("train", "evaluate", "transfer", "prepare", "check"),
-    "predict": ("predict",),
-    "import": ("import", "export"),
-    "render": ("render",),
-    "keypoints": ("keypoints",),
-}
-"""Commands by the page of their settings; the commands of a page share settings."""
-
+COMMANDS = ("train", "evaluate", "transfer", "prepare", "check",
+            "predict", "import", "export", "render", "keypoints")  # fmt: skip
 GROUPS = {
     "data": ("data",),
     "networks": ("representation", "network"),
@@ -43,6 +34,14 @@ GROUPS = {
 """Groups by the page of their settings."""
 
 _PAGE_OF = {group: page for page, groups in GROUPS.items() for group in groups}
+_HEADS = {
+    "data": "# Settings of data sets\n",
+    "networks": "# Settings of views and networks\n\nThe data set `network.in_channels` and "
+    "`network.num_classes`, which are not listed.\n",
+    "runs": "# Settings of runs\n",
+}
+_COMMON = 0.4
+"""Share of the options from which a setting is described once for the group."""
 _EXPERIMENTS = ("| experiment | content |", "| --- | --- |")
 _MARK = "<!-- generated -->\n"
 
@@ -50,12 +49,10 @@ _MARK = "<!-- generated -->\n"
 def pages() -> dict[Path, str]:
     """Return the generated pages by their paths."""
     generated: dict[str, Iterable[str]] = {
-        f"settings/{page}.md": (f"# Settings of tangent-{page}\n", *map(_command, commands))
-        for page, commands in COMMANDS.items()
+        "settings/commands.md": (_below_head("settings/commands.md"), *_commands())
     }
     for page, groups in GROUPS.items():
-        title = f"# Settings of {page}\n"
-        generated[f"settings/{page}.md"] = (title, *map(_group, groups))
+        generated[f"settings/{page}.md"] = (_HEADS[page], *map(_group, groups))
     experiments = map(_experiment, sorted((CONFIGS / "experiment").rglob("*.yaml")))
     generated["experiments.md"] = (_below_head("experiments.md"), *_EXPERIMENTS, *experiments, "")
     data_sets = dict.fromkeys(facts(name)["data"] for name in protocols())
@@ -90,47 +87,109 @@ def _facts(values: Mapping[str, str]) -> str:
     return "; ".join(f"`{name}` {value}" for name, value in values.items() if name != "data")
 
 
-def _command(name: str) -> str:
-    file = CONFIGS / f"{name}.yaml"
-    settings, note = command_settings(name), ""
-    if name != "train" and issubclass(SETTINGS[name], RunSettings):
-        of_training = command_settings("train")
-        settings = [setting for setting in settings if setting not in of_training]
-        note = "It has the settings of [tangent-train](train.md#tangent-train), "
-        note += f"except for `init_from` and `resume`{', with:' if settings else '.'}\n\n"
-    return f"## tangent-{name}\n\n{_text(description(file)[0])}\n\n{note}{_table(settings)}"
+def _commands() -> Iterable[str]:
+    """Yield the sections of the commands; a setting of several commands is described once."""
+    described: dict[Setting, str] = {}
+    for name in COMMANDS:
+        settings = [one for one in command_settings(name) if one.value or one.comment]
+        notes = []
+        if name != "train" and issubclass(SETTINGS[name], RunSettings):
+            notes = ["It has the settings of `tangent-train` except for `init_from` and `resume`."]
+            settings = [one for one in settings if described.get(one) != "train"]
+        seen = {one.name: described[one] for one in settings if one in described}
+        notes += _as_in(seen, "tangent-")
+        own = [one for one in settings if one not in described]
+        described |= dict.fromkeys(own, name)
+        about = _text(description(CONFIGS / f"{name}.yaml")[0])
+        parts = [f"## tangent-{name}", about, " ".join(notes), _list(own)]
+        yield "\n\n".join(part.rstrip() for part in parts if part) + "\n"
+
+
+def _as_in(owners: Mapping[str, str], prefix: str) -> list[str]:
+    return [
+        f"As in `{prefix}{owner}`: {_listed(one for one in owners if owners[one] == owner)}."
+        for owner in dict.fromkeys(owners.values())
+    ]
+
+
+def _listed(codes: Iterable[str]) -> str:
+    return ", ".join(f"`{code}`" for code in codes)
 
 
 def _group(name: str) -> str:
-    """Return the options of a group; settings of several options are described once, first."""
+    """Return the options of a group; settings of most options are described once, first."""
     files = sorted((CONFIGS / name).glob("*.yaml"))
     listed = {file: [s for s in read_settings(file) if _is_shown(s)] for file in files}
+    complete = [listed[file] for file in files if not _own_bases(file)]
     values: dict[tuple[str, str], Counter[str]] = {}
-    for setting in chain.from_iterable(listed.values()):
+    for setting in (one for settings in complete for one in settings):
         values.setdefault((setting.name, setting.comment), Counter())[setting.value] += 1
-    common = {
-        key: Setting(key[0], counts.most_common(1)[0][0], key[1])
-        for key, counts in sorted(values.items())
-        if counts.total() > 1
-    }
-    shared = f"Settings of several options:\n\n{_table(common.values())}" if common else ""
-    options = [_option(file, settings, common) for file, settings in listed.items()]
-    return "\n".join([f"## {name}\n", shared, *options])
-
-
-def _option(file: Path, settings: list[Setting], common: Mapping[Any, Setting]) -> str:
-    names = [f"`{file.parent.name}={name}`" for group, _, name in bases(file) if not group]
-    notes = [f"Based on {' and '.join(names)}."] if names else []
-    used = [(setting, common.get((setting.name, setting.comment))) for setting in settings]
-    also = [
-        f"`{setting.name}`" if setting == usual else _value(f"{setting.name}={setting.value}")
-        for setting, usual in used
-        if usual
+    common = [
+        Setting(key[0], counts.most_common(1)[0][0], key[1])
+        for key, counts in values.items()
+        if counts.total() >= max(2, _COMMON * len(complete))
     ]
-    notes += [f"Settings described above: {', '.join(also)}."] if also else []
-    table = _table(setting for setting, usual in used if not usual)
-    parts = [f"### {file.parent.name}={file.stem}", _prose(file), " ".join(notes), table.rstrip()]
+    described: dict[tuple[str, str], tuple[str, str]] = {}
+    parts = [f"## {name}\n"]
+    parts += [f"Settings of most options:\n\n{_list(common, _prefix(files[0]))}"] if common else []
+    return "\n".join([*parts, *(_option(file, listed, common, described) for file in files)])
+
+
+def _option(
+    file: Path,
+    listed: Mapping[Path, list[Setting]],
+    common: Collection[Setting],
+    described: dict[tuple[str, str], tuple[str, str]],
+) -> str:
+    group, bases_ = file.parent.name, _own_bases(file)
+    usual = {(one.name, one.comment): one.value for one in common}
+    inherited = {(one.name, one.comment) for base in bases_ for one in _with_bases(base, listed)}
+    changes, seen, own = [], {}, []
+    for one in listed[file]:
+        key = (one.name, one.comment)
+        typed = f"{one.name}={_written(one)}"
+        if key in inherited or key in usual:
+            changes += [typed] if key in inherited or one.value != usual[key] else []
+        elif key in described:
+            owner, value = described[key]
+            seen[one.name if one.value == value else typed] = owner
+        else:
+            own.append(one)
+            described[key] = file.stem, one.value
+    with_changes = f", with {_listed(changes)}" if changes else ""
+    based = f"Based on {_listed(f'{group}={base.stem}' for base in bases_)}{with_changes}."
+    notes = [based] if bases_ else _of_common({one.name for one in listed[file]}, common, changes)
+    notes += _as_in(seen, f"{group}=")
+    rows = _list(own, _prefix(file)).rstrip()
+    parts = [f"### {group}={file.stem}", _prose(file), " ".join(notes), rows]
     return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def _of_common(
+    names: Collection[str], common: Collection[Setting], changes: Iterable[str]
+) -> list[str]:
+    """Return notes on other defaults of the common settings, and on those that an option lacks."""
+    changed = {text.partition("=")[0]: text for text in changes}
+    has = [changed.get(one.name, one.name) for one in common if one.name in names]
+    lacks = [one.name for one in common if one.name not in names]
+    if len(lacks) > len(has):
+        return [f"Of the settings above: {_listed(has) or 'none'}."]
+    notes = [f"Other defaults: {_listed(changed.values())}."] if changed else []
+    return [*notes, f"Not here: {_listed(lacks)}."] if lacks else notes
+
+
+def _own_bases(file: Path) -> list[Path]:
+    return [file.with_name(f"{name}.yaml") for group, _, name in bases(file) if not group]
+
+
+def _with_bases(file: Path, listed: Mapping[Path, list[Setting]]) -> list[Setting]:
+    inner = [one for base in _own_bases(file) for one in _with_bases(base, listed)]
+    return [*listed[file], *inner]
+
+
+def _prefix(file: Path) -> str:
+    is_global = "@package" in file.read_text("utf-8").partition("\n")[0]
+    return "" if is_global else f"{file.parent.name}."
 
 
 def _experiment(file: Path) -> str:
@@ -140,27 +199,32 @@ def _experiment(file: Path) -> str:
 
 
 def _is_shown(setting: Setting) -> bool:
-    return bool(setting.value) and not setting.name.endswith(("_target_", "_partial_"))
+    is_plumbing = setting.name.endswith(("_target_", "_partial_"))
+    return bool(setting.value) and not is_plumbing and "null = from the data" not in setting.comment
 
 
-def _table(settings: Iterable[Setting]) -> str:
-    rows = [
-        f"| {_name(s.name)} | {_value(s.value)} | {_text(s.comment)} |"
-        for s in settings
-        if s.value or s.comment
+def _list(settings: Iterable[Setting], prefix: str = "") -> str:
+    listed = list(settings)
+    sections = {one.name.rpartition(".")[0] for one in listed}
+    items = [
+        ": ".join(filter(None, (_name(one, prefix, sections), _text(one.comment))))
+        for one in listed
     ]
-    head = ["| setting | default | meaning |", "| --- | --- | --- |"]
-    return "\n".join([*head, *rows, ""]) if rows else ""
+    return "".join(f"* {item}\n" for item in items)
 
 
-def _name(name: str) -> str:
-    group = name.rpartition(".")[2]
-    return f"[`{name}`]({_PAGE_OF[group]}.md#{group})" if group in _PAGE_OF else f"`{name}`"
+def _name(setting: Setting, prefix: str, sections: Collection[str]) -> str:
+    group = setting.name.rpartition(".")[2]
+    value = "" if setting.name in sections else f"={_written(setting)}"
+    code = f"`{prefix}{setting.name}{value}`"
+    return f"[{code}]({_PAGE_OF[group]}.md#{group})" if group in _PAGE_OF else code
 
 
-def _value(written: str) -> str:
-    code = " ".join(written.split()).replace("|", "\\|")
-    return f"`{code}`" if code else ""
+def _written(setting: Setting) -> str:
+    """Return the value of a setting as it is typed; … stands for a required one."""
+    if setting.value.startswith("- "):
+        return f"[{', '.join(re.findall(r'- (.+)', setting.value))}]"
+    return " ".join(setting.value.split()) or "…"
 
 
 def _prose(file: Path) -> str:

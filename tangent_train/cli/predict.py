@@ -140,8 +140,8 @@ class _Prediction:
         if settings.upright == "auto":
             loaded.check_predicts(PIXEL_CLASSES, "Use upright=pose, or null.")
         self._settings, self._head, self._masks = settings, head, Masks(settings.mask)
-        device, batch_size = settings.device, settings.view_batch_size
-        self._predictor = Predictor(loaded, head, views, device, batch_size)
+        on_device = settings.device, settings.view_batch_size, settings.compile
+        self._predictor = Predictor(loaded, head, views, *on_device)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
         self._depth = None
         if "depth" in loaded.inputs:
@@ -184,12 +184,17 @@ class _Prediction:
         image, files = self._upright(job.value), self.folder.files(job)
         mosaic = self._predictor.predict(image, progress, averaged="probabilities" in files)
         self._head.write_mosaic(mosaic, image, files)
-        return image, mosaic.pixels(), mosaic.facts
+
+        def result() -> tuple[Any, Any]:
+            return mosaic.pixels(), mosaic.facts
+
+        return image, result if self._head.waits else result()
 
     def write(self, job: Job) -> dict[str, Any]:
         """Write the results of one image; return its entry in the summary."""
-        predicted = PredictedImage.fetch(*job.value)
-        image, pixels, facts = predicted
+        image, result = job.value
+        predicted = PredictedImage.fetch(image, *(result() if callable(result) else result))
+        _, pixels, facts = predicted
         is_counted = np.array(True)
         if image.area is not None:
             is_counted = image.cut(self._masks.read(job.name, image.area)) > 0
@@ -219,7 +224,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     """Return the names of the settings that are read besides those of the head."""
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
     names |= {"levels", "base_level", "blend", "write", "report", "shard"}
-    names |= {"view_batch_size", "device", "trust"}
+    names |= {"view_batch_size", "compile", "device", "trust"}
     panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()

@@ -74,55 +74,56 @@ class NetworkSettings(Settings):
     """Settings of commands that load a network from a file."""
 
     checkpoint: ExistingPath
-    """network, written by tangent-train, tangent-import or tangent-export"""
+    """network file, written by tangent-train, tangent-import or tangent-export"""
     trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+    """your own packages whose classes a checkpoint may use, e.g. my_networks"""
 
 
 class LabelMapSettings(Settings):
     """Settings of commands that map the classes of a network."""
 
     label_map: str | Path | None = None
-    """maps the classes of the network to those of another data set: ade20k_to_stanford2d3ds, …, or
-    a JSON file; null = same classes"""
+    """map from the network's classes to those of another data set: a name such as
+    ade20k_to_stanford2d3ds, or a JSON file; null = same classes"""
     unmapped: Literal["unknown", "never"] = "unknown"
-    """pixels where a class without a mapping wins: unknown (label 0, wrong in an evaluation) |
-    never (the best mapped class)"""
+    """pixels whose best class is not in the label map: unknown (label 0, an error in evaluations) |
+    never (take the best class in the map)"""
 
 
 class ImageSettings(Settings):
     """Settings of commands that read images and videos."""
 
     every: PositiveInt = 1
-    """videos: use the first and then every n-th frame"""
+    """videos: read every n-th frame"""
     area: tuple[float, float, float, float] | None = None
     """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
     sphere"""
     eye: Literal["left", "right"] | None = None
-    """stereo panoramas, two pictures above or beside each other: left | right; null = not stereo"""
+    """stereo panoramas (two pictures above or beside each other): left | right; null = not
+    stereo"""
 
 
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """Settings of tangent-predict."""
 
-    not_content = ("output", "report", "shard", "view_batch_size", "device", "trust")
+    not_content = ("output", "report", "shard", "view_batch_size", "compile", "device", "trust")
 
     input: str | Path
     """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
     output: Path
     """folder for the results"""
     depth: ExistingPath | None = None
-    """folder of depth images with the names of the inputs, for networks with depth"""
+    """folder of depth images named as the inputs, for networks that need depth"""
     depth_scale: PositiveFloat = 1000
-    """units per meter in depth files of integers, read or written"""
+    """units per meter in depth files of whole numbers, read and written"""
     depth_channel: str | None = None
     """OpenEXR files: channel of depth, e.g. ViewLayer.Depth.Z; null = the one called Z, depth,
     depth.Z or depth.V"""
     projection: Literal["equirectangular", "perspective"] = "equirectangular"
     """equirectangular | perspective (photos)"""
     fill: Literal["black", "mean", "edge", "reflect"] | None = None
-    """colors outside the area, in views that leave it: black | mean (color) | edge (nearest pixel)
-    | reflect; null: as trained"""
+    """color outside a partial panorama: black | mean (color) | edge (nearest pixel) | reflect; null
+    = as in training"""
     fov: FieldOfView | None = None
     """photos: horizontal field of view in degrees; null = from EXIF"""
     views: Views = None
@@ -130,42 +131,47 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null = those of
     the checkpoint"""
     levels: OneOrMore[Level] | None = None
-    """level s, or a list of levels of tangent images to average over; null = levels of the
-    checkpoint"""
+    """level s, or several levels of tangent images to average over; null = as in the checkpoint"""
     base_level: int | None = None
-    """base level b: 20·4^b images; null = that of the checkpoint, 0 for imported networks"""
+    """tangent images of base level b (20·4^b), also for a checkpoint with other views; null = as in
+    the checkpoint"""
     blend: Blend = "feather"
-    """joins overlapping images: feather (weighted mean) | nearest"""
+    """how overlapping views are merged: feather (weighted mean) | nearest (the view with the
+    nearest center)"""
     rotations: PositiveInt = 1
-    """number of rotations about the vertical to average over"""
+    """average over this number of rotations about the vertical"""
     upright: Literal["pose", "auto"] | None = None
-    """align with gravity: pose (tags of the file) | auto (the same, else estimated); null = off"""
+    """align with gravity by: pose (tags of the file) | auto (the pose if known, else estimated);
+    null = off"""
     max_tilt_deg: Annotated[float, Field(gt=0, le=180)] = 60
-    """upright=auto: largest tilt to consider, in degrees"""
+    """upright=auto: largest tilt that is searched, in degrees"""
     mask: float | ExistingPath | None = None
-    """panoramas: pixels that become unknown (0): a latitude (-60: below it), a PNG file (black) or
-    a folder of them; null = none"""
+    """panoramas: pixels that become unknown (0): below a latitude (-60), black in a PNG file, or in
+    a folder of one file per panorama; null = none"""
     min_confidence: Share = 0
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
     min_share: Share = 0
-    """keep at least this share of each class's pixels, the most confident, below min_confidence
-    too; found on up to 32 images"""
+    """keep at least this share of each class's pixels, the most confident ones, even below
+    min_confidence; measured on up to 32 images"""
     align: Align | None = None
-    """depth: brings the views to one scale: none | scale | affine | grid (scales that vary within a
-    view); null: by the network's kind of depth"""
+    """depth: align the views with each other: none | scale | affine | grid (scales that vary within
+    a view); null = by the kind of depth"""
     depth_format: Literal["png", "npy", "exr"] | None = None
     """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
     points: PositiveInt | None = None
-    """depth, write=[points]: points of an image, at most; null = 500000"""
+    """write=[points]: largest number of points per image; null = 500000"""
     write: OneOrMore[str] | None = None
-    """files to write: labels, color, overlay, probabilities (float16), or depth, color, points
-    (PLY); null = all but the last of either; color and overlay of a video are videos"""
+    """files to write: labels, color, overlay, probabilities (float16); of depth networks: depth,
+    color, points (PLY); null = all but probabilities and points"""
     report: NonNegativeInt = 12
     """images to show in report.html; 0 = no report"""
     shard: str | int | None = None
-    """part of the images to predict, e.g. 3/16, for several machines; null = all"""
+    """part of the images for this process, e.g. 3/16; null = all"""
     view_batch_size: PositiveInt | None = None
-    """images per forward pass; null = as many as have 2^20 pixels"""
+    """views per forward pass; null = as many as have 2^20 pixels"""
+    compile: dict[str, Any] | None = None
+    """arguments of torch.compile, e.g. {mode: reduce-overhead} for CUDA graphs; {} = its defaults;
+    null = do not compile"""
     device: str = "auto"
     """auto | cpu | cuda | cuda:1 | mps"""
 
@@ -180,7 +186,7 @@ class RenderSettings(ImageSettings):
     output: Path | None = None
     """folder for the tangent images; with back=, the file of the panorama"""
     overwrite: bool = False
-    """true: replace an existing file (of figure=, poses=, or back= of one panorama)"""
+    """true: replace an existing file of figure=, poses=, or back= with one panorama"""
     views: Views = None
     """views: tangent | horizontal | horizontal_economy | horizontal_wide | cubemap, or
     'views={option: horizontal, fov: 110}'; null = tangent"""
@@ -189,55 +195,55 @@ class RenderSettings(ImageSettings):
     level: Level | None = None
     """level s, the angular resolution; null = from the rows of each panorama"""
     dim: int | None = None
-    """tangent images: side in pixels; smaller crops them, larger adds a margin; null = 2^(s−b).
-    Other views: see views"""
+    """side of tangent images in pixels: smaller crops them, larger adds a margin; null = 2^(s−b)"""
     yaw: OneOrMore[float] | None = None
-    """views in these directions instead of tangent images: degrees to the right of the middle, e.g.
+    """single views instead of tangent images: degrees to the right of the middle, e.g.
     [0,90,180,270]; null = 0"""
     pitch: OneOrMore[float] | None = None
-    """degrees above the horizon, one or as many as yaw; null = 0"""
+    """single views: degrees above the horizon, one number or as many as yaw; null = 0"""
     roll: OneOrMore[float] | None = None
-    """degrees by which the view is rolled clockwise, one or as many as yaw; null = 0"""
+    """single views: clockwise roll in degrees, one number or as many as yaw; null = 0"""
     fov: FieldOfView | tuple[FieldOfView, FieldOfView] | None = None
-    """horizontal field of view of these views in degrees, or [horizontal, vertical]; null = 90"""
+    """single views: horizontal field of view in degrees, or [horizontal, vertical]; null = 90"""
     size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = None
-    """size of these views in pixels: [width, height], or one number; null = by level and fov"""
+    """single views: [width, height] in pixels, or one number; null = by level and fov"""
     faces: OneOrMore[int] | None = None
-    """indices of the images to write, e.g. [0,5]; null = all"""
+    """indices of the views to write, e.g. [0,5]; null = all"""
     rotation: tuple[float, float, float] | None = None
-    """rotation of the views as a whole: [yaw,pitch,roll] in degrees; null = none"""
+    """rotation of all views together: [yaw,pitch,roll] in degrees; null = none"""
     format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
     interpolation: Literal["bilinear", "nearest"] = "bilinear"
     """bilinear | nearest (for labels and depth)"""
     depth_channel: str | None = None
-    """OpenEXR files: channel to read, e.g. ViewLayer.Depth.Z; null = colors, or for nearest and
-    depth the one called Z, depth, depth.Z or depth.V"""
+    """OpenEXR files: channel to read, e.g. ViewLayer.Depth.Z; null = colors, or with
+    interpolation=nearest and for depth the one called Z, depth, depth.Z or depth.V"""
     colmap: bool = False
-    """true: one project for COLMAP of all panoramas: images, masks and rig_config.json"""
+    """true: write one COLMAP project for all panoramas: images, masks and rig_config.json"""
     mask: float | ExistingPath | None = None
-    """colmap=true: pixels to ignore: a latitude (-60: below it), a PNG file (black) or a folder of
-    them; null = none"""
+    """colmap=true: ignored pixels: below a latitude (-60), black in a PNG file, or in a folder of
+    one file per panorama; null = none"""
     mask_classes: OneOrMore[str] | None = None
-    """classes to ignore, e.g. [person]; mask is then a folder with labels/ and classes.json"""
+    """ignored classes, e.g. [person], with mask= a folder that tangent-predict wrote (labels/,
+    classes.json)"""
     figure: Path | None = None
     """PNG file of the first panorama and its tangent images; output is then optional"""
     back: ExistingPath | None = None
     """folder of results on the tangent images of one panorama, or a folder of such folders"""
     poses: ExistingPath | None = None
-    """sparse model of COLMAP; the poses of its panoramas are written as JSON"""
+    """folder of a sparse COLMAP model, whose poses of panoramas are written as JSON"""
     cameras: ExistingPath | None = None
     """back=: cameras.json or its folder; null = with the results. poses=: the project; null = two
     folders up"""
     blend: Blend = "feather"
-    """joins overlapping images: feather (weighted mean) | nearest; labels and depth are not
-    averaged"""
+    """back=: how overlapping images are merged: feather (weighted mean) | nearest; labels and depth
+    are never averaged"""
     height: Rows | None = None
-    """rows of the panorama; null = those of the original"""
+    """back=: rows of the panorama; null = as the original"""
     kind: Literal["auto", "color", "labels", "depth", "features"] = "auto"
-    """kind of the results: auto | color | labels | depth | features"""
+    """back=: kind of the results: auto | color | labels | depth | features"""
     z_depth: bool = False
-    """true: convert z-depth to distance from the center"""
+    """back=: true = convert z-depth to distance from the center"""
 
 
 class ExportSettings(NetworkSettings):
@@ -257,43 +263,45 @@ class ImportSettings(Settings):
     """Settings of tangent-import."""
 
     library: Literal["torchvision", "huggingface", "smp", "onnx"] | None = None
-    """torchvision | huggingface | smp | onnx; null for an option of the group network"""
+    """source: torchvision | huggingface | smp | onnx; null with network="""
     network: Section | None = None
-    """an option of configs/network, with weights of your own"""
+    """an option of configs/network, with your own weights="""
     model: str | Path | None = None
     """name of the network in the library or on the hub, or a folder written by save_pretrained"""
     weights: str | Path | None = None
-    """torchvision: DEFAULT, another name, or a file; options of configs/network: a state dict"""
+    """torchvision: DEFAULT, another published name, or a file; network=: a file with a state
+    dict"""
     file: ExistingPath | None = None
     """library=onnx: the ONNX file"""
     classes: ExistingPath | None = None
-    """JSON list of class names in the order of the scores; null = from the model"""
+    """JSON list of class names in the order of the outputs; null = from the model"""
     normalization: str | dict[str, tuple[float, ...]] | None = None
     """imagenet | unit | symmetric | {mean: […], std: […]}; null = from the model"""
     unknown_classes: OneOrMore[str] = ()
-    """classes whose pixels are unknown, e.g. [background]"""
+    """classes that mean unknown, e.g. [background]"""
     unknown_wins: bool = True
-    """pixels where such a class wins: true: unknown (label 0) | false: the best other class"""
+    """pixels whose best class is one of unknown_classes: true = unknown (label 0) | false = the
+    best other class"""
     scores: ScoreKind | None = None
-    """output of the network: logits | probabilities | labels; null = by the sums of its values
-    (onnx)"""
+    """output of the network: logits | probabilities | labels; null = recognized from its values"""
     depth: DepthKind | None = None
-    """the network predicts depth of this kind: metric_z | metric_distance | relative_depth |
-    relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface),
-    or it predicts classes"""
+    """kind of depth that the network predicts: metric_z | metric_distance | relative_depth |
+    relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface), else
+    it predicts classes"""
     image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
-    """fixed size of the images: [rows,columns] or the side; null = from the model"""
+    """fixed image size: [rows,columns] or the side; null = from the model"""
     views: Views = None
     """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |
     erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null =
-    horizontal_wide, or tangent with levels or base_level"""
+    horizontal_wide; with levels= or base_level=, tangent"""
     levels: OneOrMore[Level] | None = None
-    """level s, or a list of levels of tangent images; null = from the side of its images, for
-    tangent images two, e.g. [9, 8]"""
+    """level s, or several levels of tangent images; null = from the image size, two for tangent
+    images, e.g. [9, 8]"""
     base_level: int | None = None
-    """base level b: 20·4^b tangent images; null = the fewest, 0 for wide ones"""
+    """tangent images of base level b (20·4^b); null = the fewest that fit the image size"""
     fov: FieldOfView = 60
-    """horizontal field of view of its photos in degrees; predictions on photos use it"""
+    """horizontal field of view in degrees of the photos it was trained on, for predictions on
+    photos"""
     output: Path
     """file to write: .ckpt, or .onnx for library=onnx"""
     overwrite: bool = False
@@ -323,15 +331,15 @@ class KeypointSettings(Settings):
     """pairs of a data set: synthrooms_pairs | stanford2d3ds_pairs | zind_pairs; unused with left=
     or input="""
     output: Path
-    """folder for the results; with the same settings, interrupted results are continued"""
+    """folder for the results; the same settings continue interrupted ones"""
     left: ExistingPath | None = None
-    """first panorama of a pair of your own, with right="""
+    """first panorama of your own pair, with right="""
     right: ExistingPath | None = None
     """second panorama of that pair"""
     input: str | Path | None = None
     """folder of your panoramas, or pattern, e.g. 'holiday/*.jpg'"""
     pairing: Literal["consecutive", "all"] = "consecutive"
-    """pairs from input: consecutive (each panorama with the next) | all"""
+    """pairs of input=: consecutive (each panorama with the next) | all"""
     base_level: OneOrMore[int] = (0, 1, 2)
     """base levels b to compare, e.g. 1 or [0,1]: 20·4^b images each"""
     level: Level | None = None
@@ -339,21 +347,21 @@ class KeypointSettings(Settings):
     margin: NonNegativeInt = 32
     """pixels added around tangent images, so that keypoints at borders are found"""
     ratio: PositiveFloat = 0.8
-    """ratio test: largest distance to the nearest neighbor over that to the second nearest; 1 =
-    off"""
+    """ratio test: largest ratio of the distances to the nearest and the second nearest neighbor; 1
+    = off"""
     mutual: bool = True
     """true: mutual nearest neighbors only"""
     max_error_deg: PositiveFloat = 1
-    """largest error of inliers of the two-view geometry, in degrees"""
+    """largest error of a match that fits the two-view geometry, in degrees"""
     seed: NonNegativeInt = 0
     """seed of random samples and rotations"""
     controls: bool = True
-    """true: also the panorama at the resolution of the tangent images, a cube map, and the right
-    panorama rotated"""
+    """true: also measure the panorama at the tangent images' resolution, a cube map, and a rotated
+    right panorama"""
     max_pairs: PositiveInt | None = None
-    """compare the first pairs only; null = all"""
+    """number of pairs to compare, from the first; null = all"""
     pictures: NonNegativeInt = 2
-    """pairs whose matches are drawn"""
+    """number of pairs whose matches are drawn"""
     export: bool = False
     """true: write keypoints and matches as COLMAP databases"""
 
@@ -364,9 +372,9 @@ class RunSettings(Settings):
     data: Section
     """data set"""
     representation: Section
-    """views of a panorama that the network is given"""
+    """views of a panorama that the network receives"""
     network: Section | None = None
-    """network that is trained"""
+    """network to train"""
     task: Section
     """segmentation | classification | depth"""
     optimizer: Section | None = None
@@ -380,19 +388,19 @@ class RunSettings(Settings):
     callbacks: Section | None = None
     """early_stopping | model_summary; null = none"""
     name: str = "run"
-    """first folder below runs/"""
+    """name of the folder in runs/"""
     seed: NonNegativeInt = 0
-    """seed of initial weights, order, images and augmentation"""
+    """seed of initial weights, sample order, choice of views and augmentation"""
     level: Level = 5
     """level s, the angular resolution: panoramas of 2^(s+1) rows"""
     panels: NonNegativeInt = 6
-    """test images drawn as panels and shown in report.html (segmentation and depth)"""
+    """number of test images in panels/ and report.html (segmentation and depth)"""
     validation_images: NonNegativeInt = 4
-    """validation images shown by loggers that can show images (segmentation and depth)"""
+    """number of validation images sent to loggers that show images (segmentation and depth)"""
     checkpoint_every_n_steps: PositiveInt | None = 500
-    """training steps between checkpoints, besides those of every epoch; null = every epoch only"""
+    """training steps between checkpoints within an epoch; null = at the end of epochs only"""
     ema: Share | None = None
-    """decay of the average of the weights, e.g. 0.999; the average is evaluated and stored; null =
+    """decay of a moving average of the weights, e.g. 0.999, which is evaluated and stored; null =
     off"""
 
 
@@ -400,12 +408,12 @@ class TrainSettings(RunSettings):
     """Settings of tangent-train."""
 
     init_from: Path | None = None
-    """fine-tuning: checkpoint, state dict or safetensors that the network starts from; null = new
-    weights"""
+    """fine-tuning: checkpoint, state dict or safetensors file to start from; null = weights of
+    network="""
     resume: Path | None = None
-    """folder of an interrupted run, which is continued with its settings"""
+    """folder of an interrupted run to continue with its settings"""
     trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+    """your own packages whose classes a checkpoint may use, e.g. my_networks"""
 
 
 class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
@@ -422,23 +430,23 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     )
 
     representation: Section | None = None  # type: ignore[assignment]
-    """views of a panorama that the network is given; null = those of the checkpoint"""
+    """views of a panorama that the network receives; null = as in the checkpoint"""
     level: Level | None = None  # type: ignore[assignment]
-    """level s, the angular resolution; null = that of the checkpoint"""
+    """level s, the angular resolution; null = as in the checkpoint"""
 
 
 class PrepareSettings(RunSettings):
     """Settings of tangent-prepare."""
 
     shard: str | int | None = None
-    """part of the cache to fill, e.g. 3/16, for several machines; null = all"""
+    """part of the cache for this process, e.g. 3/16; null = all"""
 
 
 class PhotoSettings(Settings):
     """Settings of the photos of a transfer."""
 
     data: Section | None = None
-    """data set of the photos; null with checkpoint= only"""
+    """data set of the photos; null needs checkpoint="""
     representation: Section
     """crops of the photos"""
 
@@ -456,7 +464,7 @@ class FineTuningSettings(Settings):
     epochs: OneOrMore[int] = (1, 10)
     """epochs of each fine-tuning: [1, 10] gives P-FT-1, S-FT-1, P-FT-10, S-FT-10; [] = none"""
     optimizer: FineTuningOptimizer = FineTuningOptimizer()
-    """optimizer of the fine-tuning; other settings are those of optimizer"""
+    """changes of optimizer= in fine-tuning"""
     scheduler: Section | None = None
     """schedule of the learning rate in fine-tuning"""
 
@@ -471,25 +479,26 @@ class TransferSettings(LabelMapSettings, RunSettings):
     seeds: OneOrMore[int] | None = None
     """one transfer per seed, e.g. [0, 1, 2]; null = seed"""
     folds: OneOrMore[int] | None = None
-    """one transfer per fold, e.g. [1, 2, 3]; null = data.fold, or no folds"""
+    """one transfer per fold, e.g. [1, 2, 3]; null = data.fold, if there are folds"""
     checkpoint: ExistingPath | None = None
     """network trained on photos (P), which is evaluated and fine-tuned; null = train it"""
     trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+    """your own packages whose classes a checkpoint may use, e.g. my_networks"""
     compare: OneOrMore[str | Section] = ("erp", "cubemap")
-    """further views to evaluate P on: names of representations, or settings, e.g. {name: fine,
+    """further views in which P is evaluated: representations, or settings, e.g. {name: fine,
     option: erp, rows: 1024}"""
     conditions: OneOrMore[str | Section] = ("upright",)
-    """test conditions: upright, or settings of data, e.g. {name: tilted-45, test_rotation: 45,
-    upright: auto}"""
+    """conditions of the test: upright, or settings of data, e.g. {name: tilted-45, test_rotation:
+    45, upright: auto}"""
     fine_tuning: FineTuningSettings
     """fine-tuning of P on photos (P-FT) and on panoramas (S-FT)"""
     study_levels: OneOrMore[Level] | None = None
-    """evaluate P only, on panoramas of these levels, e.g. [5, 6, 7, 8, 9, 10]; null = off"""
+    """instead of all other stages, evaluate P on panoramas of these levels, e.g. [5, 6, 7, 8, 9,
+    10]; null = off"""
     study_max_rows: Rows = 512
-    """rows of the stored panoramas; finer levels are rendered from them"""
+    """study_levels: largest number of rows that are read; finer levels are sampled from these"""
     photos: PhotoSettings
-    """the photos"""
+    """settings of the photos"""
 
 
 SETTINGS: Mapping[str, type[Settings]] = {

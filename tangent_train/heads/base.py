@@ -112,6 +112,8 @@ class Head(nn.Module, ABC):
         summary: Name of the summary of an image in the summary file.
         summary_columns: Names in the summary of an image that ``summary.csv`` lists.
         unknown: Value of unknown pixels.
+        waits: True if mosaics wait for their device before they return pixels; the next image is
+            then predicted meanwhile.
     """
 
     kind: ClassVar[str]
@@ -121,6 +123,7 @@ class Head(nn.Module, ABC):
     predict_settings: ClassVar[Mapping[str, str]] = NOTHING
     summary: ClassVar[str] = ""
     unknown: ClassVar[float] = 0
+    waits: ClassVar[bool] = False
     num_outputs: int
     is_metric: bool = True
     suffixes: Mapping[str, str] = NOTHING

@@ -105,6 +105,7 @@ class DistanceHead(Head):
     num_outputs = 1
     summary: ClassVar[str] = "depth"
     unknown: ClassVar[float] = math.nan
+    waits: ClassVar[bool] = True
     summary_columns = ("unit", *_ROWS)
 
     @validate_call

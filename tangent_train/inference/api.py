@@ -105,6 +105,7 @@ def load(
     views: ViewChoice = None,
     fill: Fill | None = None,
     view_batch_size: PositiveInt | None = None,
+    compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
     min_confidence: float = 0.0,
     align: Align | None = None,
     trust: str | Sequence[str] = (),
@@ -132,6 +133,8 @@ def load(
             as trained.
         view_batch_size: Number of images per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels.
+        compile: Arguments of `torch.compile`, e.g. ``{"mode": "reduce-overhead"}`` for CUDA graphs;
+            None to disable it.
         min_confidence: Pixels with a lower confidence get the label 0.
         align: Correction of the views of a depth network: ``none``, ``scale``, ``affine`` (a scale
             and a shift) or ``grid`` (also a coarse grid of scales). None for ``scale`` of networks
@@ -150,7 +153,7 @@ def load(
     given = {"min_confidence": min_confidence, "align": align}
     head = head_of(loaded, **{name: value for name, value in given.items() if value})
     selector = ViewSelector(loaded, levels, base_level, blend, rotations, views, fill)
-    predictor = Predictor(loaded, head, selector, device, view_batch_size)
+    predictor = Predictor(loaded, head, selector, device, view_batch_size, compile)
     return Network(loaded, predictor, UpLikelihood(original, predictor.device))
 
 

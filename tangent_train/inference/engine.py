@@ -34,7 +34,7 @@ from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.tensors import on_device
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
     from torch import Tensor, nn
@@ -201,6 +201,7 @@ class Predictor:
         view_batch_size: Number of views per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels. A network with cross-image attention takes all views of
             a panorama at once, and their outputs are kept in memory.
+        compile: Arguments of `torch.compile`, empty for its defaults; None to disable it.
 
     Attributes:
         device: Device of the network, the views and the mosaic.
@@ -216,6 +217,7 @@ class Predictor:
         views: ViewSelector,
         device: str | int | torch.device = "cpu",
         view_batch_size: int | None = None,
+        compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
     ) -> None:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -227,12 +229,24 @@ class Predictor:
         loaded.network.to(self.device).to(memory_format=torch.channels_last)
         self.head = head
         self._loaded, self._views, self._view_batch_size = loaded, views, view_batch_size
+        self._compile = compile
         self._sees_rays = sees_rays(loaded.network)
 
     @cached_property
     def _network_of_panoramas(self) -> Any:
         aware = getattr(self._views.representation, "distortion_aware", None)
-        return network_for_views(self._loaded.network, aware)
+        return self._compiled(network_for_views(self._loaded.network, aware))
+
+    @cached_property
+    def _network_of_photos(self) -> Any:
+        return self._compiled(self._loaded.network)
+
+    def _compiled(self, network: Any) -> Any:
+        if self._compile is None:
+            return network
+        compiled = torch.compile(network, **self._compile)
+        # The next call of a CUDA graph overwrites the output of the last.
+        return lambda *given, **named: plain_output(compiled(*given, **named)).clone()
 
     @torch.no_grad()
     def predict(
@@ -268,7 +282,7 @@ class Predictor:
             camera_matrix=image.camera_matrix,
         )
         per_forward = self._view_batch_size or views_per_forward(self._views.image_size(image))
-        network = self._network_of_panoramas if image.is_panorama else self._loaded.network
+        network = self._network_of_panoramas if image.is_panorama else self._network_of_photos
         if self._sees_rays:
             network = partial(network, view_batch_size=per_forward)
         count = sum(len(views) for views, _, _ in sets)

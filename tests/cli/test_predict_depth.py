@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGB_NORMALIZATION
 from tangent_train.geometry import equirect_directions
+from tangent_train.heads.alignment import AlignedMosaic
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import read_png
@@ -87,6 +89,23 @@ def test_files_of_a_panorama(
     assert (row["unit"], row["median"]) == ("m", str(entry["median"]))
     assert not (output / "classes.json").exists()
     assert "hall" in (output / "report.html").read_text()
+
+
+def test_views_are_aligned_while_the_next_image_is_predicted(
+    tmp_path: Path, network: Path, predict: Predict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pixels(tmp_path / "in" / "hall.png", sphere(32))
+    align, names = AlignedMosaic.pixels, []
+
+    def pixels(mosaic: AlignedMosaic) -> torch.Tensor:
+        names.append(threading.current_thread().name)
+        return align(mosaic)
+
+    monkeypatch.setattr(AlignedMosaic, "pixels", pixels)
+    entry = predict(checkpoint=network, compile="{backend: eager}")["hall"]["depth"]
+    assert entry["known"] == 1
+    assert len(names) == 1
+    assert names != ["MainThread"]
 
 
 def test_a_part_of_a_panorama(tmp_path: Path, network: Path, predict: Predict) -> None:

@@ -72,6 +72,37 @@ def test_a_second_image_does_not_change_the_first() -> None:
     assert (second.probabilities(slice(None)).numpy() != expected).any()
 
 
+def _as_cuda_graphs(graph: Any, _: Any) -> Any:
+    """Compile to a function that overwrites its last output, as CUDA graphs do."""
+    outputs: dict[Any, torch.Tensor] = {}
+
+    def run(*inputs: Any) -> tuple[torch.Tensor]:
+        (output,) = graph(*inputs)
+        return (outputs.setdefault(output.shape, torch.empty_like(output)).copy_(output),)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("device", "compiler"),
+    [
+        ("cpu", {"backend": _as_cuda_graphs}),
+        pytest.param("cuda", {"mode": "reduce-overhead"}, marks=pytest.mark.gpu),
+    ],
+)
+def test_a_compiled_network_predicts_the_same(device: str, compiler: dict[str, Any]) -> None:
+    network: Any = nn.Sequential(nn.Conv2d(3, 1, 3, padding=1), nn.Softplus()).eval()
+    changes: dict[str, Any] = {"module": network, "depth_kind": "metric_distance"}
+    trained = trained_network(TANGENT, class_names=(), **changes)
+    predicted = [
+        Predictor(trained, head_of(trained), ViewSelector(trained), device, 4, compile=arguments)
+        .predict(InputImage(_blocks(32, 64)))
+        .pixels()
+        for arguments in (None, compiler)
+    ]
+    torch.testing.assert_close(*predicted)
+
+
 # Panoramas.
 
 

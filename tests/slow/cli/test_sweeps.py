@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from submitit.core.utils import JobPaths
 
 from tests.cli.tiny_runs import SETTINGS, Run, results
 
@@ -60,8 +64,17 @@ def test_jobs_of_a_grid_are_runs_of_their_own_on_any_number_of_devices(
 
 @OLD_SQLALCHEMY
 def test_optuna_compares_runs_of_submitit_by_their_validation(
-    settings: tuple[str, ...], tmp_path: Path, run: Run, capfd: pytest.CaptureFixture[str]
+    settings: tuple[str, ...],
+    tmp_path: Path,
+    run: Run,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    def late(*arguments: Any, move: Callable[..., None] = JobPaths.move_temporary_file) -> None:
+        time.sleep(2)  # longer than a job needs to open its log
+        move(*arguments)
+
+    monkeypatch.setattr(JobPaths, "move_temporary_file", late)
     study = ("hydra.sweeper.n_trials=2", "hydra.sweeper.n_jobs=2", "hydra.sweep.dir=study")
     run("train", "-m", "sweep=optuna", "launcher=local", *study, *settings)
     runs = [tmp_path / "study" / number for number in "01"]
