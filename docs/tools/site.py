@@ -1,7 +1,8 @@
 """Build the documentation site: ``python -m docs.tools.site <folder>``.
 
-Zensical reads the Markdown files of one folder. It is given a copy of docs/ with the notebook as a page, the files
-from outside docs/, links between them, and typeset formulas.
+Zensical reads the Markdown files of one folder. It is given a copy of docs/ with the notebook as
+a page, the files from outside docs/, links between them, and typeset formulas. The index of its
+search is changed afterwards.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ _FORMULAS = (
 )
 """Powers, roots and the vertex resolution, as they are written in comments and docstrings too."""
 
+_GENERATED = re.compile(r"reference/(settings/|experiments|protocols)|changelog")
+_API = "reference/python_api.html#"
+
 
 def build(site: Path) -> int:
     """Build the site into a new folder; return the exit status, 1 after a warning."""
@@ -43,6 +47,8 @@ def build(site: Path) -> int:
         status = subprocess.call(command, cwd=ROOT)
         if status == 0:
             shutil.copytree(Path(folder) / "site", site)
+            index = site / "search.json"
+            index.write_text(demote_generated(index.read_text("utf-8")), "utf-8")
     return status
 
 
@@ -107,6 +113,26 @@ def notebook_to_markdown(text: str) -> str:
         parts.append(f"```python\n{source}\n```" if cell["cell_type"] == "code" else source)
         parts += map(_output, cell.get("outputs", ()))
     return "\n\n".join(parts)
+
+
+def demote_generated(index: str) -> str:
+    """Return the index of the search so that guides are found before generated pages.
+
+    Zensical has no weights, and prefers short sections. A generated page becomes one section; of
+    the Python API, only the first paragraph of each docstring is searched.
+    """
+    content = json.loads(index)
+    sections: dict[str, dict[str, Any]] = {}
+    for section in content["items"]:
+        place = section["location"]
+        if place.startswith(_API):
+            section["text"] = section["text"].partition("</p>")[0] + "</p>"
+        page = place.partition("#")[0] if _GENERATED.match(place) else place
+        if page in sections:
+            sections[page]["text"] += f" {section['title']} {section['text']}"
+        else:
+            sections[page] = section
+    return json.dumps(content | {"items": list(sections.values())}, ensure_ascii=False)
 
 
 def _output(output: dict[str, Any]) -> str:
