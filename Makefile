@@ -31,7 +31,7 @@ demo: install
 		echo "Going on with the interrupted demo …"; \
 		$(BIN)/tangent-train resume=$(DEMO) || { $(AGAIN); }; \
 	else \
-		echo "Rendering rooms, training and evaluating (about 4 minutes of CPU time) …"; \
+		echo "Rendering rooms, training and evaluating (about 3 minutes on two cores) …"; \
 		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO) || { $(AGAIN); }; \
 	fi
 

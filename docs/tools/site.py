@@ -8,6 +8,7 @@ search is changed afterwards.
 from __future__ import annotations
 
 import json
+import os
 import posixpath
 import re
 import shutil
@@ -44,7 +45,7 @@ def build(site: Path) -> int:
         write_pages(Path(folder) / "docs")
         config = shutil.copy(ROOT / "mkdocs.yml", folder)
         command = [sys.executable, "-m", "zensical", "build", "--config-file", config]
-        status = subprocess.call(command, cwd=ROOT)
+        status = subprocess.call(command, cwd=ROOT, env=os.environ | {"NO_COLOR": "1"})
         if status == 0:
             shutil.copytree(Path(folder) / "site", site)
             index = site / "search.json"

@@ -265,8 +265,8 @@ class ClassesHead(Head):
     def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> RGB:
         """Color the labels, or overlay the image with them."""
         if kind == "color":
-            return class_colors(len(self.class_names))[pixels]
-        return pictures.mixed_picture(rgb, pixels, len(self.class_names))
+            return class_colors(self.class_names)[pixels]
+        return pictures.mixed_picture(rgb, pixels, self.class_names)
 
     def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> RGB:
         """Return a picture; an overlay has a legend of the classes."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.io.gpano import black_outside
-from tangent_train.io.palette import class_colors, distance_colors
+from tangent_train.io.palette import UNKNOWN_COLOR, class_colors, distance_colors
 from tangent_train.metrics.segmentation import UNKNOWN
 
 _Image = NDArray[np.uint8]
@@ -18,7 +18,7 @@ _MARGIN = 8
 _LINE = 22
 _LEAST_ROWS = 256
 _LARGEST_ERROR = 0.5
-_WRONG, _GRAY = (214, 39, 40), 160
+_WRONG, _RIGHT = (214, 39, 40), (255, 255, 255)
 _LEGEND_WIDTH = 1200
 """Width of a picture, in pixels, per step of its legend's size."""
 
@@ -42,7 +42,7 @@ def distance_limits(*distances: NDArray[np.floating]) -> tuple[float, float]:
 def colorize_distance(
     distance: NDArray[np.floating], limits: tuple[float, float] | None = None
 ) -> _Image:
-    """Color distances ``(H, W)`` as RGB ``(H, W, 3)``: near bright, far dark, unknown black.
+    """Color distances ``(H, W)`` as RGB ``(H, W, 3)``: near bright, far dark, unknown gray.
 
     Colors change with the logarithm of the distance, as relative differences do.
 
@@ -54,10 +54,10 @@ def colorize_distance(
     is_known = np.isfinite(distance) & (distance > 0)
     place = np.log(np.where(is_known, distance, near) / near) / np.log(far / near)
     colors = distance_colors()[np.rint(255 * place.clip(0, 1)).astype(np.uint8)]
-    return np.asarray(colors * is_known[..., None], np.uint8)
+    return np.where(is_known[..., None], colors, np.uint8(UNKNOWN_COLOR))
 
 
-def mixed_picture(rgb: _Image, labels: NDArray[np.integer], num_classes: int) -> _Image:
+def mixed_picture(rgb: _Image, labels: NDArray[np.integer], class_names: tuple[str, ...]) -> _Image:
     """Overlay the lightness of a picture with its labels.
 
     The colors of the picture would change those of the classes and are left out. Class colors are
@@ -66,10 +66,10 @@ def mixed_picture(rgb: _Image, labels: NDArray[np.integer], num_classes: int) ->
     Args:
         rgb: RGB picture ``(H, W, 3)``.
         labels: Labels ``(H, W)``; unknown pixels (0) show the picture.
-        num_classes: Number of labels, K + 1.
+        class_names: Names of the K + 1 labels.
     """
     light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
-    colors = class_colors(num_classes)[labels]
+    colors = class_colors(class_names)[labels]
     mixed = cv2.addWeighted(light, 0.5, colors, 0.5, 0)
     for axis in (0, 1):
         is_border = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
@@ -79,27 +79,41 @@ def mixed_picture(rgb: _Image, labels: NDArray[np.integer], num_classes: int) ->
 
 
 def with_class_legend(
-    picture: _Image, labels: NDArray[np.integer], class_names: Sequence[str]
+    picture: _Image,
+    labels: NDArray[np.integer],
+    class_names: tuple[str, ...],
+    others: Mapping[str, Any] = MappingProxyType({}),
 ) -> _Image:
-    """Return a picture above a legend of the classes that occur, whose text grows with the width.
+    """Return a picture above a legend of the classes that occur, the largest first.
+
+    The size of its text grows with the width.
 
     Args:
         picture: RGB ``(H, W, 3)``.
         labels: Labels of any shape.
         class_names: Names of the K + 1 labels.
+        others: Further colors by name.
     """
-    width, seen = picture.shape[1], np.unique(labels)
-    scale = max(1, round(width / _LEGEND_WIDTH))
-    longest = max((len(class_names[index]) for index in seen), default=0)
+    counts = np.bincount(labels.ravel(), minlength=len(class_names))
+    seen = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
+    entries = [(class_names[k], class_colors(class_names)[k]) for k in seen] + [*others.items()]
+    width, scale = picture.shape[1], _scale(picture)
+    longest = max((len(name) for name, _ in entries), default=0)
     cell, line, side = max(104, 30 + 9 * longest) * scale, _LINE * scale, 14 * scale
     per_row = max(1, width // cell)
-    rows = -(-len(seen) // per_row)
+    rows = -(-len(entries) // per_row)
     legend = np.full((rows * line + _MARGIN * scale, width, 3), 255, np.uint8)
-    for k, index in enumerate(seen):
+    for k, (name, color) in enumerate(entries):
         x, y = k % per_row * cell + 2 * scale, k // per_row * line + _MARGIN * scale
-        legend[y : y + side, x : x + side] = class_colors(len(class_names))[index]
-        _write(legend, class_names[index], (x + 19 * scale, y + 12 * scale), scale)
+        legend[y : y + side, x : x + side] = UNKNOWN_COLOR  # a frame around bright colors
+        legend[y + scale : y + side - scale, x + scale : x + side - scale] = color
+        _write(legend, name, (x + 19 * scale, y + 12 * scale), scale)
     return np.concatenate([picture, legend])
+
+
+def _scale(picture: _Image) -> int:
+    """Return the size of the text beside a picture."""
+    return max(1, round(picture.shape[1] / _LEGEND_WIDTH))
 
 
 def with_distance_legend(picture: _Image, limits: tuple[float, float], unit: str) -> _Image:
@@ -110,8 +124,7 @@ def with_distance_legend(picture: _Image, limits: tuple[float, float], unit: str
         limits: See `colorize_distance`.
         unit: Unit, e.g. m, or relative; it is printed after the last distance.
     """
-    width = picture.shape[1]
-    scale = max(1, round(width / _LEGEND_WIDTH))
+    width, scale = picture.shape[1], _scale(picture)
     colors = distance_colors()[np.linspace(0, 255, width).astype(np.uint8)]
     bar = np.tile(colors, (_LINE * scale, 1, 1))
     near, far = f"{limits[0]:.3g}", f"{limits[1]:.3g} {unit}"
@@ -124,7 +137,7 @@ def prediction_panel(
     rgb: _Image,
     truth: NDArray[np.integer],
     prediction: NDArray[np.integer],
-    class_names: Sequence[str],
+    class_names: tuple[str, ...],
 ) -> _Image:
     """Draw input, ground truth, prediction and error in a 2 × 2 grid above a legend.
 
@@ -138,13 +151,12 @@ def prediction_panel(
         RGB image of about 2W × 2H; panoramas with less than 256 rows are enlarged by a whole
         factor. Errors are red, unlabeled pixels are gray.
     """
-    colors = class_colors(len(class_names))
-    error = np.full((*truth.shape, 3), 255, np.uint8)
-    error[prediction != truth] = _WRONG
-    error[truth == UNKNOWN] = _GRAY
-    truths, predictions = colors[truth], colors[prediction]
-    grid = _grid({"input": rgb, "truth": truths, "prediction": predictions, "error": error})
-    return with_class_legend(grid, np.stack([truth, prediction]), class_names)
+    colors = class_colors(class_names)
+    error = np.where((prediction == truth)[..., None], _RIGHT, _WRONG)
+    error[truth == UNKNOWN] = UNKNOWN_COLOR
+    tiles = {"input": rgb, "ground truth": colors[truth], "prediction": colors[prediction]}
+    grid, labels = _grid(tiles | {"error": error.astype(np.uint8)}), np.stack([truth, prediction])
+    return with_class_legend(grid, labels, class_names, {"correct": _RIGHT, "wrong": _WRONG})
 
 
 def distance_panel(
@@ -158,33 +170,34 @@ def distance_panel(
         prediction: Predicted distances ``(H, W)``.
 
     Returns:
-        RGB image as of `prediction_panel`. Relative errors are white to red, from 0 to 50 %; pixels
-        without a true distance are gray, those without a prediction are black.
+        RGB image as of `prediction_panel`, above the color scale. Relative errors are white to red,
+        from 0 to 50 %; pixels without a true distance are gray, those without a prediction are
+        black.
     """
     limits = distance_limits(truth)
     share = np.abs(prediction - truth) / (_LARGEST_ERROR * truth)
     error = 255 + np.nan_to_num(share, posinf=1)[..., None].clip(0, 1) * (np.array(_WRONG) - 255)
     error[np.isnan(prediction)] = 0
-    error[np.isnan(truth)] = _GRAY
-    scale = f"{limits[0]:.2g} to {limits[1]:.2g} m"
-    return _grid(
-        {
-            "input": rgb,
-            f"truth, {scale}": colorize_distance(truth, limits),
-            f"prediction, {scale}": colorize_distance(prediction, limits),
-            "error, 0 to 50 %": error.round().astype(np.uint8),
-        }
-    )
+    error[np.isnan(truth)] = UNKNOWN_COLOR
+    tiles = {
+        "input": rgb,
+        "ground truth": colorize_distance(truth, limits),
+        "prediction": colorize_distance(prediction, limits),
+        "error: 0 white, 50 % red": error.round().astype(np.uint8),
+    }
+    return with_distance_legend(_grid(tiles), limits, "m")
 
 
 def _grid(tiles: Mapping[str, _Image]) -> _Image:
     """Draw four images in a 2 × 2 grid, below their titles; small ones are enlarged."""
     titled = []
     for title, image in tiles.items():
-        scale = max(1, _LEAST_ROWS // len(image))
-        enlarged = image.repeat(scale, axis=0).repeat(scale, axis=1)
-        strip = np.full((_LINE, enlarged.shape[1], 3), 255, np.uint8)
-        titled.append(np.concatenate([_write(strip, title, (2, 16)), enlarged]))
+        factor = max(1, _LEAST_ROWS // len(image))
+        enlarged = image.repeat(factor, axis=0).repeat(factor, axis=1)
+        scale = _scale(enlarged)
+        strip = np.full((_LINE * scale, enlarged.shape[1], 3), 255, np.uint8)
+        _write(strip, title, (2 * scale, 16 * scale), scale)
+        titled.append(np.concatenate([strip, enlarged]))
     gap = np.full((len(titled[0]), _MARGIN, 3), 255, np.uint8)
     return np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
 
@@ -193,12 +206,11 @@ def _write(
     image: _Image,
     text: str,
     origin: tuple[int, int],
-    scale: int = 1,
+    scale: int,
     color: tuple[int, int, int] = (0, 0, 0),
-) -> _Image:
+) -> None:
     font = cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(image, text, origin, font, 0.45 * scale, color, scale, cv2.LINE_AA)
-    return image
 
 
 def shown_arrays(
@@ -219,20 +231,27 @@ def shown_arrays(
         representation: Representation that defines the crops.
         most_rows: Largest number of rows, to which larger images are downsampled; None for all.
         cut: True to cut a partial panorama to the box around its valid pixels. Elsewhere, it is
-            black and unknown.
+            gray and unknown.
 
     Returns:
-        RGB ``(H, W, 3)``, true and predicted labels ``(H, W)``; for crops, W is n·w.
+        RGB ``(H, W, 3)``, true and predicted labels ``(H, W)``; for crops, W is n·w. Where there is
+        no picture, i.e. black without a label, RGB is gray, and both labels are unknown.
     """
     shown = image.rgb, target.cpu().numpy(), prediction.cpu().numpy()
     if target.ndim == 3:
         (crops,) = image.sampler(representation).view_sets()
         rgb, truth, labels = map(np.hstack, (crops.render(image.rgb, "bilinear"), *shown[1:]))
     else:
-        rgb, truth, labels = (black_outside(array, image.valid) for array in shown)
-        if cut and image.valid is not None:
-            box = _box(image.valid)
-            rgb, truth, labels = (array[box] for array in (rgb, truth, labels))
+        rgb, truth, labels = shown
+    valid = image.valid if target.ndim == 2 else None
+    is_seen = rgb.any(axis=-1) | (truth > 0)
+    is_seen &= True if valid is None else valid
+    unknown = truth.dtype.type(np.nan if truth.dtype.kind == "f" else UNKNOWN)
+    rgb = np.where(is_seen[..., None], rgb, np.uint8(UNKNOWN_COLOR))
+    truth, labels = (np.where(is_seen, array, unknown) for array in (truth, labels))
+    if cut and valid is not None:
+        box = _box(valid)
+        rgb, truth, labels = (array[box] for array in (rgb, truth, labels))
     step = 1 if most_rows is None else -(-truth.shape[0] // most_rows)
     part = slice(step // 2, None, step)
     return rgb[part, part], truth[part, part], labels[part, part]

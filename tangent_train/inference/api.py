@@ -180,7 +180,7 @@ class Network:
     ) -> None:
         self.loaded = loaded
         self.class_names = loaded.class_names
-        self.palette = class_colors(len(loaded.class_names))
+        self.palette = class_colors(tuple(loaded.class_names))
         self._predictor, self._up_likelihood = predictor, up_likelihood
 
     def __repr__(self) -> str:

@@ -224,7 +224,7 @@ def write_report(
     """
     viewer = ""
     if images:
-        colors = class_colors(len(class_names)).tolist()  # empty without classes
+        colors = class_colors(tuple(class_names)).tolist()
         classes = [{"name": n, "rgb": c} for n, c in zip(class_names, colors, strict=False)]
         viewer = _filled(
             "viewer.html",

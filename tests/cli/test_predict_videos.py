@@ -87,7 +87,7 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
     assert sorted(of_frames) == [f"{number:06d}" for number in range(len(TIMES))]
     for name, labels in of_frames.items():
         np.testing.assert_array_equal(labels, of_images[name])
-    palette = class_colors(len(CLASS_NAMES)).astype(float)
+    palette = class_colors(tuple(CLASS_NAMES)).astype(float)
     colors = palette[np.stack(list(of_frames.values()))]
     light = frames @ np.array([[0.299], [0.587], [0.114]])
     for kind, expected in (("color", colors), ("overlay", (colors + light) / 2)):
@@ -96,7 +96,7 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
         assert (np.stack([frame() for frame in read_frames(path)]) == made).all(), "not rotated"
         assert made.shape == frames.shape
         assert made_times == pytest.approx(times)
-        assert np.abs(made - expected).mean() < 8  # compressed, with colors at half resolution
+        assert np.abs(made - expected).mean() < 10  # compressed, with colors at half resolution
     entries = predicted(tmp_path / "out")
     assert len(entries) == 2 * len(TIMES)
     with (tmp_path / "out" / "summary.csv").open(encoding="utf-8") as file:

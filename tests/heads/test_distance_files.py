@@ -14,7 +14,7 @@ from tangent_train.heads import DistanceHead, PredictedImage
 from tangent_train.heads.distance import points_of, spread_pixels
 from tangent_train.inference.images import InputImage
 from tangent_train.io.gpano import read_area
-from tangent_train.io.palette import distance_colors
+from tangent_train.io.palette import UNKNOWN_COLOR, distance_colors
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
 
 RNG = np.random.default_rng(0)
@@ -94,6 +94,6 @@ def test_a_video_has_one_range_of_colors() -> None:
     assert (painted[0] == distance_colors()[0]).all()
     place = 255 * math.log(4) / math.log(9 * 1.01)
     assert (painted[1] == distance_colors()[round(place)]).all()
-    assert not painted[2].any()
+    assert (painted[2] == UNKNOWN_COLOR).all()
     (row,) = head.table(summaries[2:3])[2]
     assert row == ["known pixels, % of the solid angle", "0"]

@@ -43,7 +43,12 @@ def test_segformer_keeps_its_normalization(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("made", "shares"),
-    [(networks.mobilevit, False), (networks.mask2former, True), (networks.eomt, True)],
+    [
+        (networks.upernet, False),
+        (networks.mobilevit, False),
+        (networks.mask2former, True),
+        (networks.eomt, True),
+    ],
 )
 def test_scores_are_those_of_the_library(
     made: Callable[[], Any], shares: bool, tmp_path: Path

@@ -18,6 +18,7 @@ from tangent_train.geometry import (
     perspective_directions,
 )
 from tangent_train.heads.pictures import colorize_distance, distance_limits
+from tangent_train.io.palette import UNKNOWN_COLOR
 from tangent_train.results.page import encode_image, write_report
 from tests.decoded import decoded
 from tests.results.box_room import HIGHEST, LOWEST, exit_points
@@ -117,7 +118,7 @@ def test_large_maps_without_a_camera_are_shrunk(tmp_path: Path) -> None:
 
 
 def test_near_is_bright_and_far_is_dark_in_equal_steps() -> None:
-    """CIELAB's lightness falls evenly with the logarithm; unknown pixels are black."""
+    """CIELAB's lightness falls evenly with the logarithm; unknown pixels are gray."""
     distance = np.geomspace(0.5, 8, 101)[None]
     colors = colorize_distance(distance, (0.5, 8.0))
     lightness = cv2.cvtColor(colors.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[0, :, 0]
@@ -125,7 +126,7 @@ def test_near_is_bright_and_far_is_dark_in_equal_steps() -> None:
     assert lightness[0] > 85 > 20 > lightness[-1]
     assert np.abs(lightness - line).max() < 3
     beyond = colorize_distance(np.array([[0.1, 100, np.nan, 0, np.inf]]), (0.5, 8.0))[0]
-    np.testing.assert_array_equal(beyond, [colors[0, 0], colors[0, -1], *np.zeros((3, 3))])
+    np.testing.assert_array_equal(beyond, [colors[0, 0], colors[0, -1], *[UNKNOWN_COLOR] * 3])
 
 
 def test_the_scale_of_several_pictures_leaves_out_rare_distances() -> None:

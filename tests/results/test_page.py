@@ -65,7 +65,7 @@ def test_names_stay_text_wherever_they_stand(nasty_page: str) -> None:
     assert [image["name"] for image in images] == [NASTY, NASTY]
     (classes,) = (json.loads(s) for s in reader.scripts if s.startswith("[{"))
     assert [entry["name"] for entry in classes] == list(NAMES)
-    assert classes[0]["rgb"] == [0, 0, 0]
+    assert classes[0]["rgb"] == [136, 136, 136]
 
 
 def test_the_page_refers_to_nothing_outside_and_forbids_it(nasty_page: str) -> None:

@@ -22,7 +22,7 @@ from tests.slow.results.browser import EDGE, OpenReport, close, opened
 HEIGHT, WIDTH = 251, 503  # odd, no powers of two
 PHOTO = (120, 200)
 NAMES = ("unknown", *(f"octant {k}" for k in range(1, 8)), "<i>last</i>")
-COLORS = class_colors(len(NAMES)).astype(np.int64)
+COLORS = class_colors(NAMES).astype(np.int64)
 START_DEG, PLANET_DEG = 95.0, 250.0
 WRONG, UNLABELED = (214, 39, 40), (110, 110, 110)
 
