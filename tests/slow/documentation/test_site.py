@@ -71,9 +71,9 @@ def test_search_finds_guides_first(site: Path, query: str, page: str) -> None:
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, chromium() as browser:
         Thread(target=server.serve_forever, daemon=True).start()
         tab = browser.new_page()
-        tab.goto(f"http://127.0.0.1:{server.server_port}/index.html")
+        tab.goto(f"http://127.0.0.1:{server.server_port}/index.html", wait_until="networkidle")
         tab.keyboard.press("Control+k")
-        tab.keyboard.type(query)
+        tab.locator("dialog input").fill(query)
         found = tab.locator("a[href*='?h=']").first.get_attribute("href")
         server.shutdown()
     assert found is not None
