@@ -39,7 +39,14 @@ from datamodules.core.label_map import (
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.config.build import checks_types
-from tangent_train.errors import SettingError, at_least, check_choice, check_type, width_height
+from tangent_train.errors import (
+    SettingError,
+    at_least,
+    check_choice,
+    check_type,
+    listed,
+    width_height,
+)
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
@@ -530,8 +537,8 @@ def map_classes(
     if foreign or len(rest) == len(names):
         raise SettingError(
             "label_map",
-            found=f"target classes {', '.join(label_map.names)}",
-            expected=f"a map from {', '.join(names)} to {', '.join(targets)}",
+            found=f"target classes {listed(label_map.names)}",
+            expected=f"a map from {listed(names)} to {listed(targets)}",
         )
     check_choice("unmapped", unmapped, ("unknown", "never"))
     if rest and loaded.score_kind == "labels":
@@ -555,7 +562,7 @@ def map_classes(
         "not in the network": [name for name in target_of if name not in known],
         "unknown where they win" if unmapped == "unknown" else "never win": rest,
     }
-    parts = [f"{target} ← {', '.join(of)}" for target, of in classes.items() if of]
-    parts += [f"{text}: {', '.join(of)}" for text, of in described.items() if of]
+    parts = [f"{target} ← {listed(of)}" for target, of in classes.items() if of]
+    parts += [f"{text}: {listed(of)}" for text, of in described.items() if of]
     changed = replace(loaded, class_names=("unknown", *targets), groups=tuple(given))
     return MappedNetwork(changed, classes, "; ".join(parts))
