@@ -47,6 +47,7 @@ from tangent_train.errors import (
     listed,
     width_height,
 )
+from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
@@ -497,13 +498,7 @@ def load_label_map(given: str | Path) -> LabelMap:
         DataError: The file is missing or is not a valid label map.
     """
     check_type("label_map", given, (str, Path), "a name or a path")
-    folder = Path(__file__).with_name("label_maps")
-    shipped = sorted(path.stem for path in folder.glob("*.json"))
-    if str(given) in shipped:
-        return read_label_map(folder / f"{given}.json")
-    if Path(given).suffix.lower() != ".json":
-        check_choice("label_map", str(given), (*shipped, "a file my_map.json"))
-    return read_label_map(Path(given))
+    return read_label_map(label_map_file(given))
 
 
 def map_classes(
