@@ -228,6 +228,8 @@ def _name(setting: Setting, prefix: str, sections: Collection[str]) -> str:
 
 def _written(setting: Setting) -> str:
     """Return the value of a setting as it is typed; … stands for a required one."""
+    if "required, unless" in setting.comment:
+        return "…"
     if setting.value.startswith("- "):
         return f"[{', '.join(re.findall(r'- (.+)', setting.value))}]"
     return " ".join(setting.value.split()) or "…"
