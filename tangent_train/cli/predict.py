@@ -17,7 +17,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted
+from tangent_train.errors import DataError, SettingError, counted, listed
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
 from tangent_train.inference import images
@@ -28,9 +28,6 @@ from tangent_train.io.inputs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
-
-_NAMED = 10
-"""Images that a message names, at most."""
 
 _COUNTED_IMAGES = 32
 """Images whose confidences are counted for `min_share`, at most."""
@@ -82,9 +79,9 @@ def predict(settings: PredictSettings) -> None:
             folder.write_page(entries, list(prediction.pictures(inputs, shown)))
         folder.table(entries).print()
         if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
-            named = ", ".join(spoiled[:_NAMED]) + ", …" * (len(spoiled) > _NAMED)
             count = counted(len(spoiled), "images")
-            print_text(f"The network's output is NaN or infinite in parts of {count}: {named}")
+            what = f"The network's output is NaN or infinite in parts of {count}"
+            print_text(f"{what}: {listed(spoiled)}")
         print_text(f"Results are in {settings.output}.")
     if errors:
         total = len(missing) + done

@@ -58,6 +58,7 @@ Eye = Literal["left", "right"]
 
 _LAYOUTS = {"top-bottom": (2, 1), "left-right": (1, 2), "bottom-top": (2, 1), "right-left": (1, 2)}
 """Pictures below and beside each other by `StereoMode`, which names the left eye first."""
+_MONO = ("", "mono")
 _UNTAGGED = ("top-bottom", "left-right")
 
 Fill = Literal["black", "mean", "edge", "reflect"]
@@ -239,23 +240,17 @@ def eye_part(
     Raises:
         DataError: It is stereo and no eye is given, or the other way round.
     """
+    if eye is None:
+        refuse_stereo(path, tags)
+        return slice(None), slice(None)
     stated = tags.get("StereoMode", "").lower()
-    if eye is None and stated in _LAYOUTS:
-        raise DataError(
-            path,
-            found=f"a stereo panorama ({stated}), by its metadata",
-            expected="one picture",
-            remedy="Give eye=left or eye=right to use the picture of one eye.",
-        )
-    for layout in () if eye is None else (stated,) if stated in _LAYOUTS else _UNTAGGED:
+    for layout in (stated,) if stated in _LAYOUTS else _UNTAGGED:
         rows, columns = (n // parts for n, parts in zip(size, _LAYOUTS[layout], strict=True))
         second = (eye == "right") == (layout in _UNTAGGED)
         top, left = (second * n % whole for n, whole in zip((rows, columns), size, strict=True))
         with suppress(DataError):
             read_area(path, (rows, columns), angles, tags=tags)
             return slice(top, top + rows), slice(left, left + columns)
-    if eye is None:
-        return slice(None), slice(None)
     raise DataError(
         path,
         found=f"{width_height(size)}, {stated or 'without stereo metadata'}",
@@ -265,15 +260,16 @@ def eye_part(
     )
 
 
-def refuse_stereo(path: Path) -> None:
-    """Raise DataError if an image of a data set is stereo by its tags."""
-    stated = read_tags(path).get("StereoMode", "").lower()
-    if stated in _LAYOUTS:
+def refuse_stereo(path: Path, tags: Mapping[str, str]) -> None:
+    """Raise DataError if an image is stereo by its tags."""
+    stated = tags.get("StereoMode", "").lower()
+    if stated not in _MONO:
         raise DataError(
             path,
             found=f"a stereo panorama ({stated}), by its metadata",
             expected="one picture",
-            remedy="Cut out the picture of one eye, from labels and depth too, and remove the tag.",
+            remedy="Give eye=left or eye=right to use the picture of one eye. In data sets, cut it "
+            "out, from labels and depth too, and remove the tag.",
         )
 
 
@@ -330,7 +326,7 @@ def check_resolution(
         DataError: Its pixels would not be square, or it is stereo by its tags.
         SettingError: It has fewer pixels.
     """
-    refuse_stereo(path)
+    refuse_stereo(path, read_tags(path))
     whole = check_area(angles) if angles is None else angles
     rows = read_area(path, size, whole, _SAME_AREA).full_shape[0]
     if size[1] < canvas.image_shape[1] - 1:
@@ -377,20 +373,35 @@ def read_up(path: Path, tags: Mapping[str, str] | None = None) -> NDArray[np.flo
 
 
 def read_tags(path: Path) -> dict[str, str]:
-    """Read the simple GPano and GSpherical properties from the XMP data of an image, by local name.
-
-    A property may have any prefix, and may be an attribute or an element (XMP specification, part
-    1). Properties of structures are ignored: they may describe another image.
+    """Read the GPano and GSpherical tags of an image, see `tags_of`.
 
     Raises:
         DataError: The file cannot be read, or XMP data with this namespace are not XML.
     """
-    packet = read_xmp(path).strip(b"\0 \n")
+    return tags_of(path, read_xmp(path))
+
+
+def tags_of(path: Path, packet: bytes) -> dict[str, str]:
+    """Return the simple GPano and GSpherical properties in XMP data, by local name.
+
+    A property may have any prefix, and may be an attribute or an element (XMP specification, part
+    1). Properties of structures are ignored: they may describe another image. In videos the root
+    itself has the properties (Google's Spherical Video V1).
+
+    Args:
+        path: File, for messages.
+        packet: XMP data; may be empty.
+
+    Raises:
+        DataError: Data with this namespace are not XML.
+    """
+    packet = packet.strip(b"\0 \n")
     # A document type, which XMP does not have, could define entities that grow.
     if not any(name.encode() in packet for name in _NAMESPACES) or b"<!DOCTYPE" in packet:
         return {}
     try:
-        nodes = [node for rdf in ElementTree.fromstring(packet).iter(_RDF) for node in rdf]
+        root = ElementTree.fromstring(packet)
+        nodes = [root, *(node for rdf in root.iter(_RDF) for node in rdf)]
     except (SyntaxError, ValueError) as error:
         raise DataError(
             path,

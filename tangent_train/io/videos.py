@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, of_extra
 from tangent_train.files import atomic_path, checked_file
-from tangent_train.io.gpano import PART_TAGS
+from tangent_train.io.gpano import PART_TAGS, tags_of
 from tangent_train.io.mp4_boxes import spherical_boxes
 from tangent_train.threads import in_threads
 
@@ -31,7 +31,6 @@ _SKEW = 0.02
 """Entries of a display matrix may differ from a quarter turn by this: one degree."""
 _SQUARE = 0.01
 """Pixels are square up to this rounding of their aspect ratio."""
-_MOST_ASPECT = 16
 _PQ, _HLG = 16, 18  # transfer functions of Rec. ITU-R BT.2100
 _SRGB: dict[str, Any] = {"dst_color_trc": 13, "dst_color_primaries": 1}
 _PROJECTIONS = {1: "a cube map", 3: "half a sphere", 5: "a fisheye picture"}
@@ -229,7 +228,7 @@ def _display(path: Path, stream: Any, frame: Any) -> _Display:
     and HLG are converted to sRGB, where white is 203 cd/m² (Rec. ITU-R BT.2408).
 
     Raises:
-        DataError: It is rotated by other angles than quarter turns, or its pixels are too long.
+        DataError: It is rotated by other angles than quarter turns.
     """
     signs, options, data = _UPRIGHT_SIGNS, {}, frame.side_data.get("DISPLAYMATRIX")
     if data is not None:
@@ -245,11 +244,6 @@ def _display(path: Path, stream: Any, frame: Any) -> _Display:
                 remedy="Export it again without rotation.",
             )
     aspect = float(stream.sample_aspect_ratio or 1)
-    if not 1 / _MOST_ASPECT <= aspect <= _MOST_ASPECT:
-        found = f"pixels {aspect:.3g} times as wide as high"
-        raise DataError(
-            path, found=found, expected=f"at most {_MOST_ASPECT} times, or a {_MOST_ASPECT}th"
-        )
     if abs(aspect - 1) > _SQUARE:
         options["width"] = round(frame.width * max(aspect, 1))
         options["height"] = round(frame.height / min(aspect, 1))
@@ -263,11 +257,15 @@ def _tags(path: Path, frame: Any) -> dict[str, str]:
     sphere, stereo = (
         np.frombuffer(bytes(found or bytes(32))[:32], np.int32).tolist() for found in data.values()
     )
-    mode, is_mesh = spherical_boxes(path)
-    mode = mode or _HALVES.get((stereo[0], stereo[1] & 1), "mono")
+    boxes = spherical_boxes(path)
+    tags = tags_of(path, boxes.xml)
+    stated = boxes.mode or tags.pop("StereoMode", "").lower()
+    mode = stated or _HALVES.get((stereo[0], stereo[1] & 1), "mono")
     found = _PROJECTIONS.get(sphere[0]) or _STEREO.get(stereo[0])
-    if is_mesh or mode not in _MODES:
-        found = "a mesh projection" if is_mesh else f"stereo of {mode}"
+    if boxes.projection or mode not in _MODES:
+        found = f"the projection {boxes.projection}" if boxes.projection else f"stereo of {mode}"
+    if tags.get("Stitched", "true").lower() not in ("true", "1"):
+        found = "pictures that are not stitched"
     if found:
         raise DataError(
             path,
@@ -276,8 +274,8 @@ def _tags(path: Path, frame: Any) -> dict[str, str]:
             remedy="Convert it, for example with FFmpeg's filter v360 or stereo3d. To remove "
             "wrong metadata: ffmpeg -i <video> -c copy <new>.mp4.",
         )
-    tags = {} if mode == "mono" else {"StereoMode": mode}
-    if data["SPHERICAL"]:
+    tags |= {} if mode == "mono" else {"StereoMode": mode}
+    if data["SPHERICAL"] and not boxes.xml:  # V1 has the direction of the first look, not the pose
         tags["PosePitchDegrees"], tags["PoseRollDegrees"] = (str(n / 2**16) for n in sphere[2:4])
     if sphere[0] == _TILE:  # shares of the sphere that are cropped at its edges
         left, top, right, bottom = (n % 2**32 / 2**32 for n in sphere[4:])

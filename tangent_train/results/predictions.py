@@ -134,7 +134,9 @@ class PredictionFolder:
     def table(self, entries: Sequence[Entry]) -> Table:
         """Return a table of the predicted images."""
         summaries = [entry[self.head.summary] for entry in entries if "error" not in entry]
-        return Table(*self.head.table(summaries))
+        title, header, rows = self.head.table(summaries)
+        ranks = range(len(rows), 0, -1)  # sorted by share
+        return Table(title, header, rows, shares=ranks, file="summary.json")
 
     def write_page(self, entries: Sequence[Entry], shown: Sequence[EncodedImage]) -> None:
         """Write ``report.html``.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -219,10 +219,25 @@ def _box(name: bytes, *content: bytes) -> bytes:
     return struct.pack(">I4s", 8 + sum(map(len, content)), name) + b"".join(content)
 
 
-def insert_boxes(path: Path, new: bytes) -> None:
-    """Insert boxes at the end of the sample entry of an MP4 file, whose moov box is its last."""
+_SAMPLE_ENTRY = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"")
+
+
+def spherical_v1(tags: Mapping[str, str]) -> bytes:
+    """The box of Spherical Video V1."""
+    listed = "".join(f"<GSpherical:{name}>{v}</GSpherical:{name}>" for name, v in tags.items())
+    xml = (
+        '<?xml version="1.0"?><rdf:SphericalVideo'
+        ' xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"'
+        f' xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">{listed}'
+        "</rdf:SphericalVideo>"
+    )
+    return _box(b"uuid", bytes.fromhex("ffcc8263f8554a938814587a02521fdd"), xml.encode())
+
+
+def insert_boxes(path: Path, new: bytes, parents: Sequence[bytes] = _SAMPLE_ENTRY) -> None:
+    """Insert boxes at the end of a box of an MP4 file, whose moov box is its last."""
     data, place, starts = bytearray(path.read_bytes()), 0, []
-    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b""):
+    for name in parents:
         while name and bytes(data[place + 4 : place + 8]) != name:
             place += struct.unpack_from(">I", data, place)[0]
         starts.append(place)

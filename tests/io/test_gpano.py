@@ -344,6 +344,11 @@ def test_the_picture_of_an_eye(
             read_area(Path("a"), size, area, tags=tags)
 
 
+def test_unknown_kinds_of_stereo_are_refused() -> None:
+    with pytest.raises(DataError, match=r"a: found a stereo panorama \(custom\)"):
+        eye_part(Path("a"), (64, 128), None, None, {"StereoMode": "custom"})
+
+
 @pytest.mark.parametrize(
     ("size", "tags", "area"),
     [

@@ -14,9 +14,15 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.io.gpano import PART_TAGS
+from tangent_train.io.gpano import PART_TAGS, read_area
 from tangent_train.io.videos import read_frames, read_video_size, read_video_tags, write_video
-from tests.datamodules.data_files import hide_start, insert_boxes, projection_boxes, stereo_box
+from tests.datamodules.data_files import (
+    hide_start,
+    insert_boxes,
+    projection_boxes,
+    spherical_v1,
+    stereo_box,
+)
 
 av: Any = pytest.importorskip("av")
 
@@ -258,7 +264,8 @@ _PART = dict(zip(PART_TAGS, ("2", "1", "0.75", "0.75", "0.25", "0.25"), strict=T
         (stereo_box(2) + _TILE, {"StereoMode": "left-right"} | _POSE | _PART),
         (stereo_box(4), {"StereoMode": "right-left"}),
         (stereo_box(3), "stereo of mode 3"),
-        (projection_boxes(b"mshp"), "a mesh projection"),
+        (projection_boxes(b"mshp"), "the projection mshp"),
+        (projection_boxes(b"cyli"), "the projection cyli"),
         (projection_boxes(b"cbmp"), "a cube map"),
     ],
 )
@@ -277,20 +284,39 @@ def test_layouts_that_the_metadata_state(
         read_video_size(path)
 
 
+_HALF = dict(zip(PART_TAGS, ("256", "128", "128", "64", "64", "32"), strict=True))
+_WHOLE = {"Spherical": "true", "Stitched": "true", "ProjectionType": "equirectangular"}
+
+
+@pytest.mark.parametrize(
+    ("tags", "error"),
+    [
+        (_WHOLE | {"InitialViewPitchDegrees": "20"}, None),
+        (_WHOLE | _HALF, None),
+        (_WHOLE | {"StereoMode": "top-bottom"}, None),
+        (_WHOLE | {"StereoMode": "custom"}, "stereo of custom"),
+        (_WHOLE | {"Stitched": "false"}, "pictures that are not stitched"),
+    ],
+)
+def test_spherical_video_v1(tmp_path: Path, tags: dict[str, str], error: str | None) -> None:
+    """The first look of V1 is not the pose of the camera."""
+    path = _write(tmp_path / "a.mp4")
+    insert_boxes(path, spherical_v1(tags), (b"moov", b"trak"))
+    if error is None:
+        assert read_video_tags(path) == tags
+        area = read_area(path, (64, 128), tags=tags)
+        assert area.full_shape == ((128, 256) if _HALF.items() <= tags.items() else (64, 128))
+        return
+    with pytest.raises(DataError, match=f"found a video with {error}"):
+        read_video_size(path)
+
+
 @pytest.mark.parametrize("mode", ["left-right", "right-left", "top-bottom", "bottom-top"])
 def test_the_eyes_of_matroska(tmp_path: Path, mode: str) -> None:
     def setup(stream: Any) -> None:
         stream.metadata["stereo_mode"] = mode.replace("-", "_")
 
     assert read_video_tags(_write(tmp_path / "a.mkv", setup=setup)) == {"StereoMode": mode}
-
-
-def test_endless_pixels_are_refused(tmp_path: Path) -> None:
-    def setup(stream: Any) -> None:
-        stream.codec_context.sample_aspect_ratio = Fraction(30, 1)
-
-    with pytest.raises(DataError, match=r"found pixels 30 times as wide as high"):
-        read_video_size(_write(tmp_path / "a.mp4", setup=setup))
 
 
 def _pq_nits(signal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -46,6 +46,20 @@ def segformer(names: Sequence[str] = NAMES) -> Made:
     return transformers.SegformerForSemanticSegmentation(config), processor
 
 
+def upernet() -> Made:
+    """A UPerNet of ConvNeXt with all its parts, as published by OpenMMLab."""
+    stages = {"hidden_sizes": [8, 8, 16, 16], "depths": [1] * 4, "out_features": _STAGES}
+    config = transformers.UperNetConfig(
+        backbone_config=transformers.ConvNextConfig(**stages),
+        hidden_size=16,
+        auxiliary_in_channels=16,
+        auxiliary_channels=8,
+        **_LABELS,
+    )
+    processor = transformers.SegformerImageProcessor(size=_SIZE, do_reduce_labels=True)
+    return transformers.UperNetForSemanticSegmentation(config), processor
+
+
 def mobilevit() -> Made:
     config = transformers.MobileViTConfig(
         hidden_sizes=[16, 16, 16],

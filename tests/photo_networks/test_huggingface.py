@@ -43,7 +43,12 @@ def test_segformer_keeps_its_normalization(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("made", "shares"),
-    [(networks.mobilevit, False), (networks.mask2former, True), (networks.eomt, True)],
+    [
+        (networks.upernet, False),
+        (networks.mobilevit, False),
+        (networks.mask2former, True),
+        (networks.eomt, True),
+    ],
 )
 def test_scores_are_those_of_the_library(
     made: Callable[[], Any], shares: bool, tmp_path: Path
@@ -182,7 +187,7 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
             {"depths": [2, 1, 1, 1]},
             "found other weights: no .*as described in config",
         ),
-        ("config.json", {"model_type": "bert"}, "model_type: found bert; expected a network for"),
+        ("config.json", {"model_type": "bert"}, "config.json: found network cannot be built"),
         ("config.json", {"hidden_act": "https://x.org/gelu"}, "config.json: found network.config"),
         ("preprocessor_config.json", {"image_std": [0, 1, 1]}, "no normalization in"),
     ],

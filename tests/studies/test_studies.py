@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -20,10 +21,12 @@ from studies.output import markdown
 from studies.point_views import SIDE, drawn
 from studies.representation_distortion import representation_distortion
 from studies.rotation_error import icosahedral_rotations, mean_error
+from studies.strips import write_strips
 from studies.surface_area import surface_area
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.geometry.icosphere import icosphere_directions
 from tangent_train.rendering import IcosphereRepresentation
+from tests.datamodules.zind_format import write_homes
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 DATA = DOCS / "results" / "data"
@@ -169,3 +172,15 @@ def test_scales_of_a_box_are_recovered_and_smooth_errors_reduced_by_a_grid() -> 
     )
     assert noisy["view"] < 2
     assert smooth["error, grid"] < smooth["error"] / 2
+
+
+def test_strips_are_a_data_set_of_the_horizon(tmp_path: Path) -> None:
+    write_homes(tmp_path / "homes", rows=128)
+    write_strips(tmp_path / "homes", tmp_path / "strips")
+    names = (tmp_path / "strips" / "test.txt").read_text().splitlines()
+    assert names
+    for name in names:
+        for folder in ("images", "labels"):
+            image = cv2.imread(str(tmp_path / "strips" / folder / f"{name}.png"), 0)
+            assert image is not None
+            assert image.shape == (50, 256)

@@ -46,7 +46,7 @@ from tests.slow.documentation.commands import TIME, fill_in, small_settings
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ROWS = 128
-SEGFORMER = "nvidia/segformer-b0-finetuned-ade-512-512"
+UPERNET = "openmmlab/upernet-convnext-tiny"
 OF_CITYSCAPES = "nvidia/segformer-b0-finetuned-cityscapes-1024-1024"
 DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"
 """Photo networks as the hub has them, where their names on the hub are paths."""
@@ -74,7 +74,7 @@ def build_world(folder: Path) -> Path:
     _write_pictures(folder)
     _write_colmap_model(folder / "project")
     small_photos = {"height": 32, "width": 32}
-    networks.saved(networks.segformer, folder / SEGFORMER, size=small_photos)
+    networks.saved(networks.upernet, folder / UPERNET, size=small_photos)
     networks.saved(depth_networks.depth_anything, folder / DEPTH_ANYTHING)
     of_streets = partial(networks.segformer, CLASSES)
     networks.saved(of_streets, folder / OF_CITYSCAPES, size=small_photos)
@@ -88,7 +88,7 @@ def build_world(folder: Path) -> Path:
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.onnx",
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.safetensors",
         "tangent-render input=room.jpg output=tangent",
-        f"tangent-import library=huggingface model={SEGFORMER} output=segformer.ckpt",
+        f"tangent-import library=huggingface model={UPERNET} output=upernet.ckpt",
         f"tangent-import library=huggingface model={OF_CITYSCAPES} output=cityscapes.ckpt",
     ):
         run(line.split(), {}, folder)
