@@ -8,7 +8,6 @@ search is changed afterwards.
 from __future__ import annotations
 
 import json
-import os
 import posixpath
 import re
 import shutil
@@ -45,12 +44,13 @@ def build(site: Path) -> int:
         write_pages(Path(folder) / "docs")
         config = shutil.copy(ROOT / "mkdocs.yml", folder)
         command = [sys.executable, "-m", "zensical", "build", "--config-file", config]
-        status = subprocess.call(command, cwd=ROOT, env=os.environ | {"NO_COLOR": "1"})
-        if status == 0:
+        done = subprocess.run(command, check=False, cwd=ROOT, capture_output=True, text=True)
+        sys.stdout.write(re.sub(r"\x1b\[[\d;]*m", "", done.stdout + done.stderr))  # no colors
+        if done.returncode == 0:
             shutil.copytree(Path(folder) / "site", site)
             index = site / "search.json"
             index.write_text(demote_generated(index.read_text("utf-8")), "utf-8")
-    return status
+    return done.returncode
 
 
 def write_pages(folder: Path) -> None:
