@@ -51,7 +51,8 @@ lint: install
 	$(BIN)/lint-imports
 
 docs: install
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --clean
+	rm -rf site
+	$(BIN)/python -m docs.tools.site site
 	@echo "The site is in site/: open site/index.html. With the search: $(BIN)/python -m http.server -d site"
 
 # NETWORK was written by tangent-import; repeated, both commands go on where they were interrupted.

@@ -6,7 +6,7 @@ python -m benchmarks methods                methods by level, see docs/results/p
 python -m benchmarks compare                measure, then compare with the baseline
 python -m benchmarks compare results.json   compare an earlier run with the baseline
 python -m benchmarks baseline results.json  write the baseline, preferably from several runs
-python -m benchmarks gpu                    all benchmarks of a GPU, see docs/results/gpu.md
+python -m benchmarks gpu                    all benchmarks of a GPU, see docs/results/speed.md
 python -m benchmarks gpu render step        some of them
 """
 

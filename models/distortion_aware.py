@@ -1,7 +1,7 @@
 """Distortion-aware convolutions, which sample an equirectangular image on the sphere.
 
 Tateno et al. 2018 ("Distortion-aware convolutional filters for dense prediction in panoramic
-images") exchange the sampling of a network that was trained on photos, Coors et al. 2018
+images") replace the sampling of a network that was trained on photos; Coors et al. 2018
 ("SphereNet") train with it. Weights, and the names of the tensors, are those of the ordinary
 network.
 """
@@ -139,7 +139,7 @@ def _framed(features: Tensor) -> Tensor:
 def make_distortion_aware(network: nn.Module) -> nn.Module:
     """Return a network with distortion-aware convolutions, which shares the tensors of a network.
 
-    All `torch.nn.Conv2d` with more than one tap are exchanged, also those that embed patches.
+    All `torch.nn.Conv2d` with more than one tap are replaced, also those that embed patches.
     Pooling, upsampling and transposed convolutions stay as they are.
 
     Args:

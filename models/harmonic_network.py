@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import torch
@@ -69,7 +69,9 @@ class HarmonicNetwork(nn.Module):
                 use_pixel_rows(getattr(self.network, name))
         for module in self.network.modules():
             if hasattr(module, "attention_handle"):
-                module.attention_handle = _plain_function(module.attention_handle)
+                # An operator of torch cannot be copied, a function can.
+                handle = module.attention_handle
+                module.attention_handle = lambda *values, handle=handle: handle(*values)
 
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
@@ -78,15 +80,6 @@ class HarmonicNetwork(nn.Module):
         with torch.autocast(images.device.type, enabled=False):  # transforms need float32
             scores: Tensor = self.network(images.float())
         return scores
-
-
-def _plain_function(operator: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Return an operator of torch as a function, which unlike the operator can be copied."""
-
-    def call(*arguments: Any) -> Tensor:
-        return operator(*arguments)
-
-    return call
 
 
 def use_pixel_rows(transform: nn.Module) -> None:

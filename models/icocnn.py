@@ -247,7 +247,7 @@ class _Block(nn.Module):
 class IcoCNN(ResidualUNet):
     """Residual U-Net of gauge equivariant convolutions (Cohen et al. 2019).
 
-    Its widths, blocks and pooling are assumptions: the article was not at hand.
+    Its widths, blocks and pooling are assumptions: the article was not available.
 
     Rotations of the signal by the 60 rotations of the icosahedron rotate its scores. Coarser levels
     have the maximum of each vertex and its neighbors; finer ones are interpolated.

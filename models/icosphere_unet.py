@@ -81,14 +81,14 @@ class IcosphereUNet(ResidualUNet):
         in_channels: Channels of the signal: 3 for RGB, 4 for RGB-D.
         num_classes: Classes K.
         level: Level s of the icosphere.
-        table: Makes the table of a level. Its positions are the vertices or faces.
+        table: Function that builds the table of a level, whose positions are vertices or faces.
         widths: Channels at each level, from s down.
         pooling: Signals of a coarser level: the `first` vertices, which it has too, or the `mean`
             of each and its ring. For faces, the `mean` or `max` of four.
         unpooling: Values of the new vertices of a finer level, before a convolution: `zeros` (the
             article), `ones` (its released code) or the `mean` of the two vertices of the edge. For
             faces: `repeat`.
-        normalized_ups: True to normalize and rectify after that convolution.
+        normalized_ups: True for normalization and ReLU after that convolution.
 
     Raises:
         SettingError: There are more widths than levels, or a kind of pooling does not fit the

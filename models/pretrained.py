@@ -156,7 +156,7 @@ def load_tensors(
 
 
 def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
-    """Extend a network of RGB images to additional channels, such as depth.
+    """Extend a network for RGB images to additional channels, such as depth.
 
     The filters of additional channels start at zero (paper, supplement, "Level 10 parameters"), so
     that the network first returns the same for RGB-D as for RGB.

@@ -186,41 +186,29 @@ class SphereContext(nn.Module):
     def _in_chunks(self, images: Tensor, rays: Tensor, size: int) -> Any:
         """Encode in chunks, mix the tokens of all, decode in chunks."""
         chunks = torch.tensor_split(images, -(-len(images) // size))  # even ones
-        # Evaluation uses no random numbers.
-        first = int(torch.randint(2**62, ())) if self.training else 0
-        seeds = range(first, first + len(chunks))
-        tokens = [
-            self._recomputed(self.encode, chunk, seed=seed, counted=False)
-            for chunk, seed in zip(chunks, seeds, strict=True)
-        ]
+        tokens = [self._recomputed(self.encode, chunk, is_counted=False) for chunk in chunks]
         contexts = torch.tensor_split(self.mix(rays, torch.cat(tokens)), len(chunks))
         parts = [
-            self._recomputed(self.decode, chunk, context, seed=seed, counted=True)
-            for chunk, context, seed in zip(chunks, contexts, seeds, strict=True)
+            self._recomputed(self.decode, chunk, context, is_counted=True)
+            for chunk, context in zip(chunks, contexts, strict=True)
         ]
         if isinstance(parts[0], Tensor):
             return torch.cat(parts)
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
-    def _recomputed(
-        self, step: Callable[..., Any], *arguments: Tensor, seed: int, counted: bool
-    ) -> Any:
+    def _recomputed(self, step: Callable[..., Any], *arguments: Tensor, is_counted: bool) -> Any:
         """Run a step without keeping activations; the backward pass runs it again.
 
-        All runs of a chunk draw the same random numbers, and only one of them (the first, if
-        `counted`) updates the running statistics of batch normalization.
+        Only one run of a chunk (the first, if `is_counted`) updates the running statistics of batch
+        normalization.
         """
-        first = iter([counted])
+        first = iter([is_counted])
 
         def run(*inputs: Tensor) -> Any:
-            frozen = () if next(first, False) else self.network.modules()
-            device = inputs[0].device
-            forked = torch.random.fork_rng([device] if device.type == "cuda" else [])
-            with forked, _frozen_statistics(frozen):
-                torch.manual_seed(seed)
+            with _frozen_statistics(() if next(first, False) else self.network.modules()):
                 return step(*inputs)
 
-        return checkpoint(run, *arguments, use_reentrant=False, preserve_rng_state=False)
+        return checkpoint(run, *arguments, use_reentrant=False)
 
 
 def token_directions(

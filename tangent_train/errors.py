@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from itertools import takewhile
@@ -171,15 +171,15 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"Did you mean {' or '.join(meant[:3])}?" if meant else ""
 
 
-def wrong_setting(error: Any, known: Mapping[str, str], prefix: str = "") -> SettingError:
+def wrong_setting(error: Any, known: Iterable[str] = (), prefix: str = "") -> SettingError:
     """Return the first error of a validation; errors of a setting's alternatives are joined.
 
     Args:
         error: pydantic's ValidationError.
-        known: Comments of the known settings by name.
+        known: Names of the known settings.
         prefix: Prefix of the setting's name in the message.
     """
-    # An unknown name first: it may be meant for a missing one.
+    # An unknown name first: other errors may follow from it.
     first = min(error.errors(), key=lambda one: _EXPECTED.get(one["type"]) != _UNKNOWN)
     cause = first.get("ctx", {}).get("error")
     if not first["loc"] and isinstance(cause, SettingError):  # of several settings together
@@ -189,7 +189,7 @@ def wrong_setting(error: Any, known: Mapping[str, str], prefix: str = "") -> Set
     common = takewhile(lambda part: len({*part}) == 1 and isinstance(part[0], str), parts)
     name = ".".join(part[0] for part in common)
     if first["type"].startswith("missing"):
-        return SettingError(prefix + name, found="nothing", expected=known.get(name, "a value"))
+        return SettingError(prefix + name, found="nothing", expected="a value")
     texts = (_EXPECTED.get(one["type"]) or one.get("ctx", {}).get("error") for one in same)
     messages = (re.sub("^Input should be |, unable to .*", "", one["msg"]) for one in same)
     expected = dict.fromkeys(str(text or m) for text, m in zip(texts, messages, strict=True))
@@ -204,7 +204,7 @@ def wrong_setting(error: Any, known: Mapping[str, str], prefix: str = "") -> Set
 
 def wrong_field(error: Any) -> str:
     """Return the first error of a validation of a file's content, for a message."""
-    wrong = wrong_setting(error, {})
+    wrong = wrong_setting(error)
     return f"{wrong.subject}={wrong.found}, not {wrong.expected}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -34,7 +33,7 @@ from datamodules.core.inputs import (
     normalize,
 )
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES, UNKNOWN_NAME, LabelMap
-from tangent_train.errors import DataError, SettingError, width_height
+from tangent_train.errors import DataError, width_height
 from tangent_train.geometry import PanoramaPose, shift_range
 from tangent_train.geometry.sphere import check_area
 from tangent_train.io.gpano import (
@@ -292,18 +291,7 @@ class PhotoDataModule(ImageDataModule):
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """See `ImageDataModule`: the crops fit into the photo."""
         camera: Any = self.decode_camera(files)
-        fov_deg, (_, columns) = self.representation.fov_deg, self.representation.image_size
-        rows = int(size[0] / 2 / (camera[1, 1] * math.tan(math.radians(fov_deg) / 2)) * columns)
-        try:
-            shift_range(camera, size, fov_deg, self.representation.image_size)
-        except SettingError as error:
-            # A setting: if it fits none of the photos, it is refused once.
-            raise SettingError(
-                "representation.fov_deg",
-                found=f"{error.found}, {files.rgb}",
-                expected=f"all of a crop of {fov_deg:g}°",
-                remedy=f"Lower it, or crop fewer rows: representation.dim=[{rows},{columns}].",
-            ) from error
+        shift_range(camera, size, self.representation.fov_deg, self.representation.image_size)
 
 
 @data_set

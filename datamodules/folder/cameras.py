@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,61 +40,47 @@ class _Pinhole(BaseModel, extra="forbid"):
     cy: float
 
 
-@dataclass(frozen=True)
-class FolderCameras:
-    """Cameras of the photos in one folder.
+def photo_camera(
+    cameras: Mapping[str, NDArray[np.float64]], files: ImageFiles, fov_deg: float | None
+) -> NDArray[np.float64]:
+    """Return the camera matrix of a photo.
 
-    Attributes:
-        path: Path of ``cameras.json``, which may be missing.
-        matrices: ``(3, 3)`` K by name of an image or folder; ``.`` for all images.
-        fov_deg: Horizontal field of view of all other photos; None to read it from EXIF data.
+    Args:
+        cameras: Result of `read_folder_cameras`.
+        files: Files of the photo.
+        fov_deg: Horizontal field of view of other photos; None to read it from EXIF data.
+
+    Returns:
+        ``(3, 3)`` K of the photo as displayed (EXIF orientation applied) for integer pixel
+        centers, of the photo or its nearest folder; otherwise from `fov_deg` or EXIF data, with the
+        principal point in the middle.
+
+    Raises:
+        DataError: The camera is unknown or does not fit the photo.
     """
-
-    path: Path
-    matrices: Mapping[str, Any]
-    fov_deg: float | None
-
-    def matrix(self, files: ImageFiles) -> NDArray[np.float64]:
-        """Return the camera matrix of a photo.
-
-        Args:
-            files: Files of the photo.
-
-        Returns:
-            ``(3, 3)`` K of the photo as displayed (EXIF orientation applied) for integer pixel
-            centers, from the entry of ``cameras.json`` for the photo or its nearest folder;
-            otherwise from `fov_deg` or EXIF data, with the principal point in the middle.
-
-        Raises:
-            DataError: The camera is unknown or does not fit the photo.
-        """
-        height, width = size = read_image_size(files.rgb)
-        name = PurePosixPath(files.name)
-        places = (place.as_posix() for place in (name, *name.parents))
-        matrix = next((self.matrices[p] for p in places if p in self.matrices), None)
-        if matrix is None:
-            return camera_matrix_from_fov(self._fov_deg(files.rgb), size)
-        (fx, _, x), (_, fy, y), _ = matrix.tolist()
-        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
-            found = f"fx = {fx:g}, fy = {fy:g}, cx = {x:g}, cy = {y:g} for {files.name}"
-            expected = f"a principal point inside {width} × {height} pixels"
-            raise DataError(self.path, found=found, expected=expected)
-        return np.asarray(matrix)
-
-    def _fov_deg(self, path: Path) -> float:
-        fov_deg = photo_fov_deg(path) if self.fov_deg is None else self.fov_deg
+    height, width = size = read_image_size(files.rgb)
+    name = PurePosixPath(files.name)
+    places = (place.as_posix() for place in (name, *name.parents))
+    matrix = next((cameras[place] for place in places if place in cameras), None)
+    if matrix is None:
+        fov_deg = fov_deg or photo_fov_deg(files.rgb)
         if fov_deg is None:
             raise DataError(
-                path,
+                files.rgb,
                 found="no K in cameras.json, no data.fov and no focal length in its EXIF data",
                 expected="one of the three",
                 remedy="Name it or its folder in cameras.json, or give data.fov=<horizontal field "
                 "of view in degrees> (65 to 80 for most phones).",
             )
-        return fov_deg
+        return camera_matrix_from_fov(fov_deg, size)
+    x, y = matrix[:2, 2]
+    if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+        expected = f"a principal point inside {width} × {height} pixels"
+        raise DataError(files.rgb, found=f"cx = {x:g}, cy = {y:g}", expected=expected)
+    return matrix
 
 
-def read_folder_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
+def read_folder_cameras(path: Path) -> dict[str, NDArray[np.float64]]:
     """Read a ``cameras.json``.
 
     It holds K by name of an image, e.g. ``kitchen/door``, or of a folder, for all its images that
@@ -106,7 +91,9 @@ def read_folder_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
 
     Args:
         path: File, which may be missing.
-        fov_deg: Horizontal field of view of all other photos, see `FolderCameras`.
+
+    Returns:
+        ``(3, 3)`` K by name of an image or folder; ``.`` for all images.
 
     Raises:
         DataError: The file cannot be read, or has another content.
@@ -117,4 +104,4 @@ def read_folder_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
     for name, k in cameras.items():
         rows = k if isinstance(k, tuple) else [[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]]
         matrices[PurePosixPath(composed(name)).as_posix()] = np.array(rows, np.float64)
-    return FolderCameras(path, matrices, fov_deg)
+    return matrices

@@ -8,7 +8,7 @@ On disk::
       labels/[scene/]…/name.png     values or colors of the classes, at the size of the image
       depth/[scene/]…/name.png      or .tif, .npy, .exr, if depth is an input, see `read_depth_m`
       cameras.json                  of photos, if wanted, see `read_folder_cameras`
-      train.txt val.txt test.txt    if wanted, names one per line, see `FolderSplits`
+      train.txt val.txt test.txt    if wanted, names one per line, see `divide_images`
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from datamodules.core.depth import meters_to_steps
 from datamodules.core.files import ImageFiles, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.label_map import LabelMap, read_label_map
-from datamodules.folder.cameras import FolderCameras, read_folder_cameras
-from datamodules.folder.splits import FolderSplits
+from datamodules.folder.cameras import photo_camera, read_folder_cameras
+from datamodules.folder.splits import divide_images
 from tangent_train.errors import DataError
 from tangent_train.io import image_files
 from tangent_train.io.pixel_files import read_depth_m
@@ -39,7 +39,7 @@ class LabeledFolder(ImageDataModule):
     """Files, splits and classes of a user-defined data set. Depth is clipped to 4 m.
 
     Args:
-        test_fraction: Share of the scenes for the test, without lists, see `FolderSplits`;
+        test_fraction: Share of the scenes for the test, without lists, see `divide_images`;
             `val_fraction` is a share of the training scenes.
         split_seed: Seed of both splits. Independent of the run's seed, so that runs with
             different seeds share their splits.
@@ -64,10 +64,9 @@ class LabeledFolder(ImageDataModule):
     def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
         images = self._list_images()
-        self._note_ignored(images)
-        splits = FolderSplits(self.root, self.test_fraction, self.val_fraction, self.split_seed)
+        fractions = self.test_fraction, self.val_fraction
         with self.problems.noted():  # all images are checked even without splits
-            return splits.divide(images, self.problems)
+            return divide_images(self.root, images, self.problems, fractions, self.split_seed)
         return {"train": images}  # type: ignore[unreachable]  # the error was noted
 
     def _list_images(self) -> list[ImageFiles]:
@@ -99,20 +98,6 @@ class LabeledFolder(ImageDataModule):
             found.setdefault(name, files)
         return [found[name] for name in sorted(found)]
 
-    def _note_ignored(self, images: Sequence[ImageFiles]) -> None:
-        """Warn of files that training passes over: labels of no image, and no images."""
-        names = {files.name for files in images}
-        folder = self.root / ("depth" if self.has_distances else "labels")
-        strays = sorted({_name(folder, path) for path in image_files.walk_files(folder)} - names)
-        if strays:
-            found = f"{len(strays)} without an image, e.g. {repr(strays[0])[1:-1]}"
-            self.problems.warnings.append(f"{folder}: {found}")
-        folder = self.root / "images"
-        others = {*image_files.walk_files(folder)} - {files.rgb for files in images}
-        suffixes = {path.suffix.lower() for path in others}
-        if unknown := sorted(suffixes - {*image_files.IMAGE_SUFFIXES}):
-            self.problems.warnings.append(f"{folder}: files {', '.join(unknown)} are not images")
-
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`."""
         path: Any = files.depth
@@ -133,18 +118,18 @@ class FolderPhotos(LabeledFolder, PhotoDataModule):
             None to read it from EXIF data.
     """
 
-    cache_settings = ("cameras",)
+    cache_settings = ("cameras", "fov")
 
     fov: Annotated[float, Field(gt=0, lt=180)] | None = None
 
     @cached_property
-    def cameras(self) -> FolderCameras:
-        """Cameras of the photos."""
-        return read_folder_cameras(self.root / "cameras.json", self.fov)
+    def cameras(self) -> dict[str, NDArray[np.float64]]:
+        """Cameras of photos and folders."""
+        return read_folder_cameras(self.root / "cameras.json")
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """Return the camera by ``cameras.json``, the field of view or the EXIF data."""
-        return self.cameras.matrix(files)
+        return photo_camera(self.cameras, files, self.fov)
 
 
 def _name(folder: Path, path: Path) -> str:

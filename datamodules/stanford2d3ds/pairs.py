@@ -11,7 +11,6 @@ hard although six easy pairs have the same overlap, 0.86: the split uses figures
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
@@ -94,29 +93,19 @@ class StanfordPairs(PanoramaPairs):
             for files in list_pictures(self.root, area, "pano", True, problems)
         ]
         problems.refuse(self.root)
-        by_name: defaultdict[str, list[ImageFiles]] = defaultdict(list)
-        for image in files:
-            by_name[f"{_camera(image)}_{image.name.split('/')[1]}"].append(image)
+        by_name = {f"{_camera(image)}_{image.name.split('/')[1]}": image for image in files}
         wanted = {name for p in self.published.values() for name in (p.left, p.right)}
-        if wrong := [name for name in sorted(wanted) if len(by_name[name]) != 1]:
-            raise DataError(
-                self.root,
-                found=", ".join(f"{name} ({len(by_name[name])} times)" for name in wrong),
-                expected="one panorama for each image of the paper's pairs",
-                remedy="Copy or extract area_1 again; data.selection=rooms uses all panoramas.",
-            )
-        chosen = [
-            (number, by_name[pair.left][0], by_name[pair.right][0])
+        if missing := sorted(wanted - by_name.keys()):
+            found, expected = f"no panorama {', '.join(missing)}", "all of the paper's pairs"
+            raise DataError(self.root, found=found, expected=expected, remedy=GET_IT)
+        return [
+            (number, by_name[pair.left], by_name[pair.right])
             for number, pair in self.published.items()
         ] or [
             ("_".join([*one.name[5:].split("/")[:2], _camera(one), _camera(other)]), one, other)
             for one, other in combinations(files, 2)
             if room_of(one) == room_of(other)
         ]
-        if not chosen:
-            none, expected = "no two panoramas of one room", "area_1 and so on, with pairs"
-            raise DataError(self.root, found=none, expected=expected, remedy=GET_IT)
-        return chosen
 
     def panorama(self, files: ImageFiles) -> PairedPanorama:
         """See `PanoramaPairs`."""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,12 +21,7 @@ from numpy.typing import NDArray
 from datamodules.core.depth import distance_from_z_depth
 from datamodules.core.files import Problems
 from datamodules.synthia import reader
-from tangent_train.geometry import (
-    equirect_latitudes,
-    equirect_longitudes,
-    lonlat_to_xyz,
-    rotation_about,
-)
+from tangent_train.geometry import CubeGrid, PinholeGrid, equirect_directions
 from tangent_train.io.pixel_files import read_image_size, read_rgb, write_pixels
 from tangent_train.manifest import MANIFEST, Manifest
 from tangent_train.progress import show_progress
@@ -39,10 +34,10 @@ _NOWHERE = -2  # a position outside all images, whatever interpolation reads aro
 
 
 class ViewStitcher:
-    """Stitches the four views of a frame to a panorama; its tables are computed once.
+    """Stitches the four views of a frame to a panorama; positions are computed once.
 
     Args:
-        camera_matrix: ``(3, 3)`` K of all views, integer pixel centers, without skew.
+        camera_matrix: ``(3, 3)`` K of all views, integer pixel centers; their middle is its center.
         size: Rows and columns of all views.
         height: Rows of the panorama, which is twice as wide.
 
@@ -53,65 +48,31 @@ class ViewStitcher:
     def __init__(
         self, camera_matrix: NDArray[np.float64], size: tuple[int, int], height: int
     ) -> None:
-        rows, columns = size
-        owner, x, y = _view_positions(camera_matrix, height)
+        self.camera_matrix = camera_matrix
+        (rows, columns), axes = size, CubeGrid(2).world_from_camera[: len(reader.VIEWS)]
+        grid = PinholeGrid(axes, size, 1 / camera_matrix[0, 0])
+        directions = equirect_directions((height, 2 * height))
+        owner = grid.owners(directions[height // 2])  # all pixels of a column have the same
+        x, y = np.moveaxis(grid.project(directions, owner), -1, 0)
         # A view extends to the outer edges of its pixels. Beyond the outermost centers, these are
         # repeated: in the stack of all views, the next rows belong to another view.
-        seen = (np.abs(x - (columns - 1) / 2) <= columns / 2) & (
-            np.abs(y - (rows - 1) / 2) <= rows / 2
-        )
-        x, y = np.clip(x, 0, columns - 1), np.clip(y, 0, rows - 1) + owner * rows
-        map_x, map_y = (np.where(seen, place, _NOWHERE).astype(np.float32) for place in (x, y))
-        self._tables = {
-            # OpenCV's precision for 8-bit images, 1/32 pixel: faster, and half the memory.
-            "bilinear": cv2.convertMaps(map_x, map_y, cv2.CV_16SC2),
-            "nearest": cv2.convertMaps(map_x, map_y, cv2.CV_16SC2, nninterpolation=True),
-        }
-        self.camera_matrix = camera_matrix
+        seen = (x >= -0.5) & (x <= columns - 0.5) & (y >= -0.5) & (y <= rows - 0.5)
+        x, y = x.clip(0, columns - 1), y.clip(0, rows - 1) + owner * rows
+        self._maps = [np.where(seen, place, _NOWHERE).astype(np.float32) for place in (x, y)]
 
     def stitch(
-        self,
-        views: Sequence[NDArray[Any]],
-        interpolation: Literal["bilinear", "nearest"],
-        elsewhere: int = 0,
+        self, views: Sequence[NDArray[Any]], interpolation: int, elsewhere: int = 0
     ) -> NDArray[Any]:
         """Return panorama ``(H, W[, C])`` of images in the order of `VIEWS`.
 
         Args:
             views: Images of the views.
-            interpolation: `bilinear` for colors, `nearest` for labels and distances.
+            interpolation: ``cv2.INTER_LINEAR`` for colors, ``cv2.INTER_NEAREST`` for labels and
+                distances.
             elsewhere: Value outside the views.
         """
-        return cv2.remap(
-            np.concatenate(views),
-            *self._tables[interpolation],
-            cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=elsewhere,
-        )
-
-
-def _view_positions(
-    camera_matrix: NDArray[np.float64], height: int
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the view that owns each column of a panorama, and its pixels in that view.
-
-    All pixels of a column belong to the view whose optical axis is nearest, as the views are
-    upright: there they are nearest to the image center.
-
-    Returns:
-        ``(W,)`` index in `VIEWS`, ``(W,)`` columns and ``(H, W)`` rows.
-    """
-    width = 2 * height
-    level = lonlat_to_xyz(np.stack([equirect_longitudes(width), np.zeros(width)], axis=-1))
-    rotations = [rotation_about((0, 0, 1), k * np.pi / 2) for k in range(len(reader.VIEWS))]
-    ahead, right, _ = np.moveaxis(np.stack([level @ rotation for rotation in rotations]), -1, 0)
-    owner = ahead.argmax(axis=0)
-    columns = np.arange(width)
-    ahead, right = ahead[owner, columns], right[owner, columns]
-    down = -np.tan(equirect_latitudes(height))[:, None] / ahead
-    x = camera_matrix[0, 0] * right / ahead + camera_matrix[0, 2]
-    return owner, x, camera_matrix[1, 1] * down + camera_matrix[1, 2]
+        border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": elsewhere}
+        return cv2.remap(np.concatenate(views), *self._maps, interpolation, **border)
 
 
 def make_panoramas(
@@ -169,9 +130,9 @@ def _make(
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
         ids = [reader.read_first_channel(view.labels).astype(np.uint8) for view in views]
         parts: dict[Any, NDArray[Any]] = {
-            target.depth: stitcher.stitch(far, "nearest"),
-            target.labels: stitcher.stitch(ids, "nearest", reader.INVALID),
-            target.rgb: stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),
+            target.depth: stitcher.stitch(far, cv2.INTER_NEAREST),
+            target.labels: stitcher.stitch(ids, cv2.INTER_NEAREST, reader.INVALID),
+            target.rgb: stitcher.stitch([read_rgb(view.rgb) for view in views], cv2.INTER_LINEAR),
         }
         for path, image in parts.items():
             write_pixels(path, image)

@@ -53,7 +53,6 @@ from datamodules.core.label_map import LabelMap
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, read_whole
 from datamodules.zind.homes import GET_IT, HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR
-from tangent_train.errors import DataError
 from tangent_train.files import read_json
 
 
@@ -148,7 +147,7 @@ class ZindPairs(PanoramaPairs):
         """See `PanoramaPairs`; names are the room and both panoramas.
 
         Raises:
-            DataError: There are no pairs, or a file is broken.
+            DataError: A file is broken.
         """
         problems = Problems()
         listed = list_home_panoramas(self.root, problems)
@@ -161,13 +160,6 @@ class ZindPairs(PanoramaPairs):
             if one.room == other.room and away_m <= (self.max_distance_m or math.inf):
                 left, right = (panorama.name.rpartition("/")[2] for panorama in (one, other))
                 pairs.append((f"{one.room}/{left} – {right}", one, other))
-        if not pairs:
-            raise DataError(
-                self.root,
-                found="no two panoramas of one room",
-                expected="layout_visible, is_inside and scale_meters_per_coordinate of some",
-                remedy=f"Set data.max_distance_m=null for any distance. {GET_IT}",
-            )
         return pairs
 
     def panorama(self, files: HomePanorama) -> PairedPanorama:

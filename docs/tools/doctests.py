@@ -1,4 +1,4 @@
-"""Extension of Griffe: doctests in docstrings are shown as code."""
+"""Extension of Griffe: doctests in docstrings are shown as code, formulas are typeset."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from typing import Any
 
 import griffe
 
+from docs.tools.site import typeset
+
 _DOCTEST = re.compile(r"^( *)(>>> .*(?:\n *\S.*)*)", re.MULTILINE)
 
 
 class Doctests(griffe.Extension):
-    """Put the doctests of every docstring in a code block."""
+    """Put doctests in code blocks; typeset formulas."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         """Change the docstring of an object; called by Griffe."""
         if obj.docstring is not None:
-            obj.docstring.value = _DOCTEST.sub(
+            text = _DOCTEST.sub(
                 lambda found: f"{found[1]}```pycon\n{found[0]}\n{found[1]}```", obj.docstring.value
             )
+            obj.docstring.value = typeset(text)

@@ -35,14 +35,16 @@ GROUPS = {
 
 _PAGE_OF = {group: page for page, groups in GROUPS.items() for group in groups}
 _HEADS = {
-    "data": "# Settings of data sets\n",
-    "networks": "# Settings of views and networks\n\nThe data set `network.in_channels` and "
-    "`network.num_classes`, which are not listed.\n",
+    "data": "# Settings of data sets\n\n[Data sets](../data_sets.md) lists content and files.\n",
+    "networks": "# Settings of views and networks\n\n`network.in_channels` and "
+    "`network.num_classes` follow from the data and are not listed.\n",
     "runs": "# Settings of runs\n",
 }
 _COMMON = 0.4
 """Share of the options from which a setting is described once for the group."""
-_EXPERIMENTS = ("| experiment | content |", "| --- | --- |")
+_USUAL_FACTS = {"area": "none", "mask": "none", "test_rotation": "none", "weighting": "pixels"}
+"""Facts of most protocols, which the page states once."""
+
 _MARK = "<!-- generated -->\n"
 
 
@@ -54,7 +56,7 @@ def pages() -> dict[Path, str]:
     for page, groups in GROUPS.items():
         generated[f"settings/{page}.md"] = (_HEADS[page], *map(_group, groups))
     experiments = map(_experiment, sorted((CONFIGS / "experiment").rglob("*.yaml")))
-    generated["experiments.md"] = (_below_head("experiments.md"), *_EXPERIMENTS, *experiments, "")
+    generated["experiments.md"] = (_below_head("experiments.md"), *experiments, "")
     data_sets = dict.fromkeys(facts(name)["data"] for name in protocols())
     generated["protocols.md"] = (_below_head("protocols.md"), *map(_data_set, data_sets))
     return {REFERENCE / name: "\n".join(parts) for name, parts in generated.items()}
@@ -66,25 +68,27 @@ def _below_head(name: str) -> str:
 
 
 def _data_set(data: str) -> str:
-    """Return the section of a data set: the facts of its protocols, and notes on them."""
+    """Return the section of a data set: the source and the facts of its protocols."""
     found = {name: facts(name) for name in protocols() if facts(name)["data"] == data}
     counts = Counter(fact for of in found.values() for fact in of.items())
     usual = dict(fact for fact, count in counts.items() if count > max(1, len(found) / 2))
-    rows, notes = [], []
+    items = []
     for name, of in found.items():
         entry = protocols()[name]
-        run = f"`{entry['experiment']}`" if "experiment" in entry else "–"
         every = dict.fromkeys(usual, "–") | of  # depth has no classes
         own = _facts({fact: value for fact, value in every.items() if usual.get(fact) != value})
-        rows.append(f"| `{name}` | {own} | {run} |")
-        notes += [f"* `{name}`: {entry['about']}"] if "about" in entry else []
-    start = f"Unless a row states other values: {_facts(usual)}.\n\n" if usual else ""
-    table = ["| protocol | facts | experiment |", "| --- | --- | --- |", *rows, ""]
-    return f"## {data}\n\n{start}" + "\n".join([*table, *notes, ""])
+        run = f"Experiment: `{entry['experiment']}`" if "experiment" in entry else ""
+        parts = [
+            f"{part.removesuffix('.')}." for part in (entry.get("about", ""), own, run) if part
+        ]
+        items.append(f"* `{name}`: {' '.join(parts)}" if parts else f"* `{name}`")
+    start = f"Unless stated otherwise: {_facts(usual)}.\n\n" if _facts(usual) else ""
+    return f"## {data}\n\n{start}" + "\n".join([*items, ""])
 
 
 def _facts(values: Mapping[str, str]) -> str:
-    return "; ".join(f"`{name}` {value}" for name, value in values.items() if name != "data")
+    shown = {k: v for k, v in values.items() if k != "data" and _USUAL_FACTS.get(k) != v}
+    return "; ".join(f"`{name}` {value}" for name, value in shown.items())
 
 
 def _commands() -> Iterable[str]:
@@ -131,7 +135,7 @@ def _group(name: str) -> str:
     ]
     described: dict[tuple[str, str], tuple[str, str]] = {}
     parts = [f"## {name}\n"]
-    parts += [f"Settings of most options:\n\n{_list(common, _prefix(files[0]))}"] if common else []
+    parts += [f"Common settings:\n\n{_list(common, _prefix(files[0]))}"] if common else []
     return "\n".join([*parts, *(_option(file, listed, common, described) for file in files)])
 
 
@@ -158,7 +162,9 @@ def _option(
             described[key] = file.stem, one.value
     with_changes = f", with {_listed(changes)}" if changes else ""
     based = f"Based on {_listed(f'{group}={base.stem}' for base in bases_)}{with_changes}."
-    notes = [based] if bases_ else _of_common({one.name for one in listed[file]}, common, changes)
+    names = {one.name for one in listed[file]}
+    other = [one for one in common if one.name not in {setting.name for setting in own}]
+    notes = [based] if bases_ else _of_common(names, other, changes)
     notes += _as_in(seen, f"{group}=")
     rows = _list(own, _prefix(file)).rstrip()
     parts = [f"### {group}={file.stem}", _prose(file), " ".join(notes), rows]
@@ -173,9 +179,9 @@ def _of_common(
     has = [changed.get(one.name, one.name) for one in common if one.name in names]
     lacks = [one.name for one in common if one.name not in names]
     if len(lacks) > len(has):
-        return [f"Of the settings above: {_listed(has) or 'none'}."]
+        return [f"Of the common settings: {_listed(has)}."] if has else ["No common settings."]
     notes = [f"Other defaults: {_listed(changed.values())}."] if changed else []
-    return [*notes, f"Not here: {_listed(lacks)}."] if lacks else notes
+    return [*notes, f"Without {_listed(lacks)}."] if lacks else notes
 
 
 def _own_bases(file: Path) -> list[Path]:
@@ -195,7 +201,7 @@ def _prefix(file: Path) -> str:
 def _experiment(file: Path) -> str:
     name = file.relative_to(CONFIGS / "experiment").with_suffix("").as_posix()
     about = re.split(r"(?<! al)\.(?: |$)", " ".join(description(file)))[0]
-    return f"| `{name}` | {_text(about, '../')} |"
+    return f"* `{name}`: {_text(about, '../')}"
 
 
 def _is_shown(setting: Setting) -> bool:

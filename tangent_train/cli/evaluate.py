@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
-from tangent_train.config.settings import EvaluateSettings, is_within, typed_names
+from tangent_train.config.settings import EvaluateSettings
 from tangent_train.errors import SettingError
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
@@ -25,12 +25,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     Raises:
         SettingError: The network does not fit the data, or nothing reads a typed setting.
     """
-    hydra, typed = HydraConfig.get(), typed_names()
-    names = "data", "experiment"
-    if "data" in hydra.runtime.choices and not any(is_within(name, names) for name in typed):
-        expected = "the data set of the evaluation, data=… or experiment=…"
-        raise SettingError("data", found="nothing", expected=expected)
-    folder = Path(hydra.runtime.output_dir)
+    folder = Path(HydraConfig.get().runtime.output_dir)
     _refuse_folder_of_run(folder)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     loaded = load_network(settings.checkpoint, settings.trust)

@@ -69,23 +69,24 @@ def _main(command: str) -> None:
     import hydra
 
     from tangent_train.cli.processes import OF_SWEEPS, in_sweep, run_job
-    from tangent_train.config.command_line import check_words
+    from tangent_train.config.command_line import check_words, with_help
     from tangent_train.config.help import annotate, listed_by_files
-    from tangent_train.config.settings import config_name, refuse_typed, validate
+    from tangent_train.config.settings import config_name, missing_groups, refuse_typed, validate
     from tangent_train.files import config_folder
 
     def job(config: Any) -> Any:
-        if in_sweep():  # outside the block: the other jobs go on
+        missing = missing_groups(command)
+        if in_sweep() and not missing:  # outside the block: the other jobs go on
             return run_job(command)
         with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions
-            settings = validate(command, config)
-            refuse_typed(settings.not_read, f"no such setting: tangent-{command} does not read it")
             refuse_typed(OF_SWEEPS, f"a sweep: tangent-{command} -m …")
+            settings = validate(command, config, missing)
             import_module("tangent_train.cli.paths").check_paths(settings)
             return _run(command, settings)
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors are raised here, not printed by Hydra
     with _errors_as_messages(command):
+        sys.argv[1:] = with_help(sys.argv[1:])
         check_words(command, sys.argv[1:])
         name = config_name(command, sys.argv[1:])
         run = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)
@@ -110,9 +111,10 @@ def report() -> None:
     """Run ``tangent-report <run folders>``: write tables and a chart over runs."""
     _print_version("report")
     from tangent_train.cli.report import report as write_report
+    from tangent_train.config.command_line import with_help
 
     with _errors_as_messages("report"):
-        write_report(sys.argv[1:])
+        write_report(with_help(sys.argv[1:]))
 
 
 def overview() -> None:

@@ -109,7 +109,7 @@ def check_types(
     try:
         typed = TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
     except ValidationError as error:
-        raise wrong_setting(error, {}, prefix) from error
+        raise wrong_setting(error, prefix=prefix) from error
     return {**values, **typed}
 
 

@@ -5,16 +5,19 @@ from __future__ import annotations
 import re
 from argparse import ArgumentError
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationResolutionError
 
+from tangent_train.config.help import command_settings
 from tangent_train.config.settings import (
     SETTINGS,
     RunSettings,
@@ -30,6 +33,16 @@ _POSITIONAL = ("checkpoint", "model", "input", "output")
 
 _OF_FILES = {"import": ("file", "output"), "keypoints": ("left", "right", "output")}
 """These settings by the command, if the first word is a file."""
+
+
+def with_help(arguments: Sequence[str]) -> list[str]:
+    """Replace words that mean ``--help``, also misspelled ones.
+
+    >>> with_help(["help", "name=help"]), with_help(["level=5", "--hlep", "--hydra-help"])
+    (['--help', 'name=help'], ['level=5', '--help', '--hydra-help'])
+    """
+    similar = [w for w in arguments if "=" not in w and get_close_matches(w.strip("-"), ["help"])]
+    return ["--help" if word in similar and word[0] in "-h" else word for word in arguments]
 
 
 def check_words(command: str, arguments: Sequence[str]) -> None:
@@ -67,9 +80,18 @@ def check_words(command: str, arguments: Sequence[str]) -> None:
         raise SettingError(words[0], found="a word without =", expected=expected, remedy=remedy)
     for one in OverridesParser.create().parse_overrides(parsed.overrides):
         group, value, options = one.key_or_group, one.value(), _options(one.key_or_group)
-        if options and not one.is_delete() and isinstance(value, bool | int | float | None):
-            expected = f"one of {', '.join(options)}, or ~{group}"
-            raise SettingError(group, found=one.get_value_element_as_str(), expected=expected)
+        unread, expected = SETTINGS[command].not_read, f"one of {', '.join(options)}, or ~{group}"
+        known = [s.name for s in command_settings(command) if not is_within(s.name, unread)]
+        if is_within(group, unread) or (options and group not in known):
+            expected = f"no such setting: tangent-{command} does not read it"
+            remedy = nearest(group, known) if options else ""
+            raise SettingError(group, found="a value", expected=expected, remedy=remedy)
+        values = value.list if isinstance(value, ChoiceSweep) else value
+        values = values if isinstance(values, list) else [values]
+        is_wrong = any(isinstance(name, bool | int | float | None) for name in values)
+        if options and is_wrong and not one.is_delete():
+            found = str(one.input_line).partition("=")[2]
+            raise SettingError(group, found=found, expected=expected)
 
 
 def _options(group: str) -> list[str]:

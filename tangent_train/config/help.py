@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
+from textwrap import wrap
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
@@ -16,11 +18,12 @@ from hydra.core.object_type import ObjectType
 from tangent_train.config.settings import SETTINGS, Settings, comment_of, plain
 from tangent_train.files import config_folder
 
-_COLUMN = 32
+_COLUMN, _WIDTH = 32, 100
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """The loader in C, which takes a tenth of the time, where PyYAML has it."""
 
 _BASE = re.compile(r"^  - (?:/(\w+)@(\w+): )?(?!_self_)(\w+)$", re.MULTILINE)
+_HEADING = re.compile(r"^class (\w+)|^    # --- (.*) ---$|^    (\w+): ", re.MULTILINE)
 _GENERAL = {
     "_target_": "Python class or function",
     "_partial_": "true: the run adds further arguments",
@@ -65,10 +68,25 @@ def annotate(text: str, command: str) -> str:
         text: Help text, with the composed settings after the heading "Settings".
         command: Name of the command.
     """
-    *head, printed = re.split(r"^(== Settings.*\n)", text, flags=re.MULTILINE)
-    comments = _option_comments(config_folder())
+    head, title, printed = re.split(r"^(== Settings.*\n)", text, flags=re.MULTILINE)
+    values, comments = yaml.safe_load(printed), _option_comments(config_folder())
     comments |= {("", s.name): s.comment for s in command_settings(command)}
-    return "".join([*head, *_explain(yaml.safe_load(printed), comments, (), ())])
+    headings = _headings(SETTINGS[command])
+    groups: dict[str, list[str]] = {h: [] for h in ("required", *headings.values(), "other")}
+    # Sections last: they would separate the other settings of a group.
+    for name in sorted(values, key=lambda name: isinstance(values[name], dict)):
+        is_given = values[name] != "???"
+        groups[headings.get(name, "other") if is_given else "required"].append(name)
+    lines = [line for text in head.splitlines() for line in _wrapped(text, "    ")] + [title[:-1]]
+    for heading, names in groups.items():
+        lines += [f"\n# --- {heading} ---"] * bool(names)
+        lines += _explain({name: values[name] for name in names}, comments, (), ())
+    return "\n".join([*lines, ""])
+
+
+def _wrapped(text: str, indent: str, width: int = _WIDTH) -> list[str]:
+    how: Any = {"break_long_words": False, "break_on_hyphens": False}
+    return wrap(text, width, subsequent_indent=indent, **how) or [""]
 
 
 def command_settings(command: str) -> list[Setting]:
@@ -93,6 +111,20 @@ def _declared(kind: type[Settings], prefix: str) -> Iterator[Setting]:
         yield Setting(f"{prefix}{name}", value, comment_of(field))
         if has_inner:
             yield from _declared(inner, f"{prefix}{name}.")  # type: ignore[arg-type]
+
+
+def _headings(kind: type[Settings]) -> dict[str, str]:
+    """Return the headings above the settings of a class and its bases, from their source."""
+    of_classes: dict[str, dict[str, str]] = {}
+    for owner, title, name in _HEADING.findall(Path(inspect.getfile(Settings)).read_text("utf-8")):
+        if owner:
+            found, heading = of_classes.setdefault(owner, {}), ""
+        elif title:
+            heading = title
+        elif heading:
+            found[name] = heading
+    bases_first = reversed(kind.__mro__)
+    return {n: h for base in bases_first for n, h in of_classes.get(base.__name__, {}).items()}
 
 
 def read_settings(file: Path) -> list[Setting]:
@@ -172,8 +204,12 @@ def _explain(
         found = (comments.get((owner, ".".join(names[depth:]))) for owner, depth in keys)
         comment = next(filter(None, found), _GENERAL.get(key, ""))
         is_section = isinstance(value, Mapping) and value
-        line = "  " * len(parents) + f"{key}:" + ("" if is_section else f" {_flow(value)}")
-        yield f"{line:<{_COLUMN - 1}} # {comment}\n" if comment else f"{line}\n"
+        indent, left = "  " * len(parents), f"{key}:" + ("" if is_section else f" {_flow(value)}")
+        *above, line = _wrapped(indent + left, indent + "    ")
+        texts = [" " * _COLUMN + f"# {one}" for one in _wrapped(comment, "", _WIDTH - _COLUMN - 2)]
+        if len(line) < _COLUMN and comment:  # beside it, else below
+            line = f"{line:<{_COLUMN}}" + texts.pop(0)[_COLUMN:]
+        yield from (*above, line, *(texts if comment else ()))
         if is_section:
             yield from _explain(value, comments, names, owners or [(key, 1)])
 

@@ -1,7 +1,8 @@
 """Settings of the commands: name, type, default and comment, once.
 
 A class gives Hydra the defaults (`config_name`), validates the composed settings (`validate`),
-and feeds ``--help`` and the reference page with its comments. Options of groups (``data=…``) are
+and feeds ``--help`` and the reference page with its comments. Lines ``# --- … ---`` are headings in
+``--help``. Options of groups (``data=…``) are
 YAML files; their types are those of the class that they build.
 """
 
@@ -73,6 +74,7 @@ class Settings(BaseModel):
 class NetworkSettings(Settings):
     """Settings of commands that load a network from a file."""
 
+    # --- network ---
     checkpoint: ExistingPath
     """network file, written by tangent-train, tangent-import or tangent-export"""
     trust: OneOrMore[str] = ()
@@ -82,6 +84,7 @@ class NetworkSettings(Settings):
 class LabelMapSettings(Settings):
     """Settings of commands that map the classes of a network."""
 
+    # --- classes ---
     label_map: str | Path | None = None
     """map from the network's classes to those of another data set: a name such as
     ade20k_to_stanford2d3ds, or a JSON file; null = same classes"""
@@ -93,6 +96,7 @@ class LabelMapSettings(Settings):
 class ImageSettings(Settings):
     """Settings of commands that read images and videos."""
 
+    # --- input ---
     every: PositiveInt = 1
     """videos: read every n-th frame"""
     area: tuple[float, float, float, float] | None = None
@@ -108,10 +112,13 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 
     not_content = ("output", "report", "shard", "view_batch_size", "compile", "device", "trust")
 
+    # --- input ---
     input: str | Path
     """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
-    output: Path
-    """folder for the results"""
+    projection: Literal["equirectangular", "perspective"] = "equirectangular"
+    """equirectangular | perspective (photos)"""
+    fov: FieldOfView | None = None
+    """photos: horizontal field of view in degrees; null = from EXIF"""
     depth: ExistingPath | None = None
     """folder of depth images named as the inputs, for networks that need depth"""
     depth_scale: PositiveFloat = 1000
@@ -119,13 +126,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     depth_channel: str | None = None
     """OpenEXR files: channel of depth, e.g. ViewLayer.Depth.Z; null = the one called Z, depth,
     depth.Z or depth.V"""
-    projection: Literal["equirectangular", "perspective"] = "equirectangular"
-    """equirectangular | perspective (photos)"""
-    fill: Literal["black", "mean", "edge", "reflect"] | None = None
-    """color outside a partial panorama: black | mean (color) | edge (nearest pixel) | reflect; null
-    = as in training"""
-    fov: FieldOfView | None = None
-    """photos: horizontal field of view in degrees; null = from EXIF"""
+
+    # --- views ---
     views: Views = None
     """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy | erp |
     erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null = those of
@@ -135,6 +137,9 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     base_level: int | None = None
     """tangent images of base level b (20·4^b), also for a checkpoint with other views; null = as in
     the checkpoint"""
+    fill: Literal["black", "mean", "edge", "reflect"] | None = None
+    """color outside a partial panorama: black | mean (color) | edge (nearest pixel) | reflect; null
+    = as in training"""
     blend: Blend = "feather"
     """how overlapping views are merged: feather (weighted mean) | nearest (the view with the
     nearest center)"""
@@ -145,6 +150,16 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     null = off"""
     max_tilt_deg: Annotated[float, Field(gt=0, le=180)] = 60
     """upright=auto: largest tilt that is searched, in degrees"""
+    align: Align | None = None
+    """depth: align the views with each other: none | scale | affine | grid (scales that vary within
+    a view); null = by the kind of depth"""
+
+    # --- output ---
+    output: Path
+    """folder for the results"""
+    write: OneOrMore[str] | None = None
+    """files to write: labels, color, overlay, probabilities (float16); of depth networks: depth,
+    color, points (PLY); null = all but probabilities and points"""
     mask: float | ExistingPath | None = None
     """panoramas: pixels that become unknown (0): below a latitude (-60), black in a PNG file, or in
     a folder of one file per panorama; null = none"""
@@ -153,18 +168,14 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     min_share: Share = 0
     """keep at least this share of each class's pixels, the most confident ones, even below
     min_confidence; measured on up to 32 images"""
-    align: Align | None = None
-    """depth: align the views with each other: none | scale | affine | grid (scales that vary within
-    a view); null = by the kind of depth"""
     depth_format: Literal["png", "npy", "exr"] | None = None
     """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
     points: PositiveInt | None = None
     """write=[points]: largest number of points per image; null = 500000"""
-    write: OneOrMore[str] | None = None
-    """files to write: labels, color, overlay, probabilities (float16); of depth networks: depth,
-    color, points (PLY); null = all but probabilities and points"""
     report: NonNegativeInt = 12
     """images to show in report.html; 0 = no report"""
+
+    # --- performance ---
     shard: str | int | None = None
     """part of the images for this process, e.g. 3/16; null = all"""
     view_batch_size: PositiveInt | None = None
@@ -181,12 +192,17 @@ class RenderSettings(ImageSettings):
 
     not_content = ("figure", "output", "overwrite")
 
+    # --- input ---
     input: str | Path | None = None
-    """panorama or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
-    output: Path | None = None
-    """folder for the tangent images; with back=, the file of the panorama"""
-    overwrite: bool = False
-    """true: replace an existing file of figure=, poses=, or back= with one panorama"""
+    """required without back= or poses=: panorama or video, folder of them, or pattern, e.g.
+    'holiday/*.jpg'"""
+    depth_channel: str | None = None
+    """OpenEXR files: channel to read, e.g. ViewLayer.Depth.Z; null = colors, or with
+    interpolation=nearest and for depth the one called Z, depth, depth.Z or depth.V"""
+    interpolation: Literal["bilinear", "nearest"] = "bilinear"
+    """bilinear | nearest (for labels and depth)"""
+
+    # --- views ---
     views: Views = None
     """views: tangent | horizontal | horizontal_economy | horizontal_wide | cubemap, or
     'views={option: horizontal, fov: 110}'; null = tangent"""
@@ -196,6 +212,12 @@ class RenderSettings(ImageSettings):
     """level s, the angular resolution; null = from the rows of each panorama"""
     dim: int | None = None
     """side of tangent images in pixels: smaller crops them, larger adds a margin; null = 2^(s−b)"""
+    faces: OneOrMore[int] | None = None
+    """indices of the views to write, e.g. [0,5]; null = all"""
+    rotation: tuple[float, float, float] | None = None
+    """rotation of all views together: [yaw,pitch,roll] in degrees; null = none"""
+
+    # --- views in given directions ---
     yaw: OneOrMore[float] | None = None
     """single views instead of tangent images: degrees to the right of the middle, e.g.
     [0,90,180,270]; null = 0"""
@@ -207,17 +229,18 @@ class RenderSettings(ImageSettings):
     """single views: horizontal field of view in degrees, or [horizontal, vertical]; null = 90"""
     size: PositiveInt | tuple[PositiveInt, PositiveInt] | None = None
     """single views: [width, height] in pixels, or one number; null = by level and fov"""
-    faces: OneOrMore[int] | None = None
-    """indices of the views to write, e.g. [0,5]; null = all"""
-    rotation: tuple[float, float, float] | None = None
-    """rotation of all views together: [yaw,pitch,roll] in degrees; null = none"""
+
+    # --- output ---
+    output: Path | None = None
+    """folder for the tangent images; with back=, the file of the panorama"""
+    overwrite: bool = False
+    """true: replace an existing file of figure=, poses=, or back= with one panorama"""
     format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
-    interpolation: Literal["bilinear", "nearest"] = "bilinear"
-    """bilinear | nearest (for labels and depth)"""
-    depth_channel: str | None = None
-    """OpenEXR files: channel to read, e.g. ViewLayer.Depth.Z; null = colors, or with
-    interpolation=nearest and for depth the one called Z, depth, depth.Z or depth.V"""
+    figure: Path | None = None
+    """PNG file of the first panorama and its tangent images; output is then optional"""
+
+    # --- COLMAP ---
     colmap: bool = False
     """true: write one COLMAP project for all panoramas: images, masks and rig_config.json"""
     mask: float | ExistingPath | None = None
@@ -226,12 +249,12 @@ class RenderSettings(ImageSettings):
     mask_classes: OneOrMore[str] | None = None
     """ignored classes, e.g. [person], with mask= a folder that tangent-predict wrote (labels/,
     classes.json)"""
-    figure: Path | None = None
-    """PNG file of the first panorama and its tangent images; output is then optional"""
-    back: ExistingPath | None = None
-    """folder of results on the tangent images of one panorama, or a folder of such folders"""
     poses: ExistingPath | None = None
     """folder of a sparse COLMAP model, whose poses of panoramas are written as JSON"""
+
+    # --- back to panoramas ---
+    back: ExistingPath | None = None
+    """folder of results on the tangent images of one panorama, or a folder of such folders"""
     cameras: ExistingPath | None = None
     """back=: cameras.json or its folder; null = with the results. poses=: the project; null = two
     folders up"""
@@ -249,21 +272,23 @@ class RenderSettings(ImageSettings):
 class ExportSettings(NetworkSettings):
     """Settings of tangent-export."""
 
+    # --- output ---
     output: Path
     """file: .onnx or .safetensors"""
+    overwrite: bool = False
+    """true: replace an existing file"""
     image_size: tuple[int, int] | None = None
     """fixed size of the images: [height, width]; null = any size that the network accepts"""
     opset: int | None = None
     """ONNX operator set; null = default of the exporter"""
-    overwrite: bool = False
-    """true: replace an existing file"""
 
 
 class ImportSettings(Settings):
     """Settings of tangent-import."""
 
+    # --- network ---
     library: Literal["torchvision", "huggingface", "smp", "onnx"] | None = None
-    """source: torchvision | huggingface | smp | onnx; null with network="""
+    """required without network=: torchvision | huggingface | smp | onnx"""
     network: Section | None = None
     """an option of configs/network, with your own weights="""
     model: str | Path | None = None
@@ -273,15 +298,6 @@ class ImportSettings(Settings):
     dict"""
     file: ExistingPath | None = None
     """library=onnx: the ONNX file"""
-    classes: ExistingPath | None = None
-    """JSON list of class names in the order of the outputs; null = from the model"""
-    normalization: str | dict[str, tuple[float, ...]] | None = None
-    """imagenet | unit | symmetric | {mean: […], std: […]}; null = from the model"""
-    unknown_classes: OneOrMore[str] = ()
-    """classes that mean unknown, e.g. [background]"""
-    unknown_wins: bool = True
-    """pixels whose best class is one of unknown_classes: true = unknown (label 0) | false = the
-    best other class"""
     scores: ScoreKind | None = None
     """output of the network: logits | probabilities | labels; null = recognized from its values"""
     depth: DepthKind | None = None
@@ -290,6 +306,22 @@ class ImportSettings(Settings):
     it predicts classes"""
     image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
     """fixed image size: [rows,columns] or the side; null = from the model"""
+
+    # --- classes ---
+    classes: ExistingPath | None = None
+    """JSON list of class names in the order of the outputs; null = from the model"""
+    unknown_classes: OneOrMore[str] = ()
+    """classes that mean unknown, e.g. [background]"""
+    unknown_wins: bool = True
+    """pixels whose best class is one of unknown_classes: true = unknown (label 0) | false = the
+    best other class"""
+
+    # --- photos and views ---
+    normalization: str | dict[str, tuple[float, ...]] | None = None
+    """imagenet | unit | symmetric | {mean: […], std: […]}; null = from the model"""
+    fov: FieldOfView = 60
+    """horizontal field of view in degrees of the photos it was trained on, for predictions on
+    photos"""
     views: Views = None
     """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |
     erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null =
@@ -299,9 +331,8 @@ class ImportSettings(Settings):
     images, e.g. [9, 8]"""
     base_level: int | None = None
     """tangent images of base level b (20·4^b); null = the fewest that fit the image size"""
-    fov: FieldOfView = 60
-    """horizontal field of view in degrees of the photos it was trained on, for predictions on
-    photos"""
+
+    # --- output ---
     output: Path
     """file to write: .ckpt, or .onnx for library=onnx"""
     overwrite: bool = False
@@ -313,13 +344,12 @@ class ImportSettings(Settings):
         """Refuse settings that name no trained network."""
         is_own = values.get("network") is not None
         if values.get("library") is None and not (is_own and values.get("weights")):
-            options = sorted(path.stem for path in (config_folder() / "network").glob("*.yaml"))
             raise SettingError(
                 "weights" if is_own else "library",
                 found="null",
-                expected="a trained network, which tangent-import writes as a checkpoint: library="
-                "torchvision, huggingface, smp or onnx; or network= with weights=<its file>",
-                remedy=f"Options of network=: {', '.join(options)}. To train one: tangent-train.",
+                expected="a trained network: library=torchvision, huggingface, smp or onnx; or "
+                "network= with weights=<its file>",
+                remedy=f"Example: {_example('import')}",
             )
         return values
 
@@ -327,11 +357,10 @@ class ImportSettings(Settings):
 class KeypointSettings(Settings):
     """Settings of tangent-keypoints."""
 
+    # --- input ---
     data: Section | None = None
     """pairs of a data set: synthrooms_pairs | stanford2d3ds_pairs | zind_pairs; unused with left=
     or input="""
-    output: Path
-    """folder for the results; the same settings continue interrupted ones"""
     left: ExistingPath | None = None
     """first panorama of your own pair, with right="""
     right: ExistingPath | None = None
@@ -340,12 +369,18 @@ class KeypointSettings(Settings):
     """folder of your panoramas, or pattern, e.g. 'holiday/*.jpg'"""
     pairing: Literal["consecutive", "all"] = "consecutive"
     """pairs of input=: consecutive (each panorama with the next) | all"""
+    max_pairs: PositiveInt | None = None
+    """number of pairs to compare, from the first; null = all"""
+
+    # --- views ---
     base_level: OneOrMore[int] = (0, 1, 2)
     """base levels b to compare, e.g. 1 or [0,1]: 20·4^b images each"""
     level: Level | None = None
     """level s, the angular resolution, at most that of the panorama; null = from its rows"""
     margin: NonNegativeInt = 32
     """pixels added around tangent images, so that keypoints at borders are found"""
+
+    # --- matching ---
     ratio: PositiveFloat = 0.8
     """ratio test: largest ratio of the distances to the nearest and the second nearest neighbor; 1
     = off"""
@@ -353,13 +388,15 @@ class KeypointSettings(Settings):
     """true: mutual nearest neighbors only"""
     max_error_deg: PositiveFloat = 1
     """largest error of a match that fits the two-view geometry, in degrees"""
-    seed: NonNegativeInt = 0
-    """seed of random samples and rotations"""
     controls: bool = True
     """true: also measure the panorama at the tangent images' resolution, a cube map, and a rotated
     right panorama"""
-    max_pairs: PositiveInt | None = None
-    """number of pairs to compare, from the first; null = all"""
+    seed: NonNegativeInt = 0
+    """seed of random samples and rotations"""
+
+    # --- output ---
+    output: Path
+    """folder for the results; the same settings continue interrupted ones"""
     pictures: NonNegativeInt = 2
     """number of pairs whose matches are drawn"""
     export: bool = False
@@ -369,12 +406,30 @@ class KeypointSettings(Settings):
 class RunSettings(Settings):
     """Settings of a run, which experiments may set."""
 
+    # --- run ---
+    name: str = "run"
+    """name of the folder in runs/"""
+    seed: NonNegativeInt = 0
+    """seed of initial weights, sample order, choice of views and augmentation"""
+
+    # --- data ---
     data: Section
-    """data set"""
+    """data set; required, unless experiment= chooses it"""
+
+    # --- views ---
+    level: Level = 5
+    """level s, the angular resolution: panoramas of 2^(s+1) rows"""
     representation: Section
     """views of a panorama that the network receives"""
+
+    # --- network ---
     network: Section | None = None
     """network to train"""
+
+    # --- training ---
+    ema: Share | None = None
+    """decay of a moving average of the weights, e.g. 0.999, which is evaluated and stored; null =
+    off"""
     task: Section
     """segmentation | classification | depth"""
     optimizer: Section | None = None
@@ -383,35 +438,31 @@ class RunSettings(Settings):
     """schedule of the learning rate"""
     trainer: Section
     """default | ddp (several processes)"""
-    logger: Section | None = None
-    """csv | tensorboard | wandb | mlflow | many | none"""
     callbacks: Section | None = None
     """early_stopping | model_summary; null = none"""
-    name: str = "run"
-    """name of the folder in runs/"""
-    seed: NonNegativeInt = 0
-    """seed of initial weights, sample order, choice of views and augmentation"""
-    level: Level = 5
-    """level s, the angular resolution: panoramas of 2^(s+1) rows"""
+
+    # --- output ---
     panels: NonNegativeInt = 6
     """number of test images in panels/ and report.html (segmentation and depth)"""
     validation_images: NonNegativeInt = 4
     """number of validation images sent to loggers that show images (segmentation and depth)"""
     checkpoint_every_n_steps: PositiveInt | None = 500
     """training steps between checkpoints within an epoch; null = at the end of epochs only"""
-    ema: Share | None = None
-    """decay of a moving average of the weights, e.g. 0.999, which is evaluated and stored; null =
-    off"""
+    logger: Section | None = None
+    """csv | tensorboard | wandb | mlflow | many | none"""
 
 
 class TrainSettings(RunSettings):
     """Settings of tangent-train."""
 
+    # --- run ---
+    resume: Path | None = None
+    """folder of an interrupted run to continue with its settings"""
+
+    # --- network ---
     init_from: Path | None = None
     """fine-tuning: checkpoint, state dict or safetensors file to start from; null = weights of
     network="""
-    resume: Path | None = None
-    """folder of an interrupted run to continue with its settings"""
     trust: OneOrMore[str] = ()
     """your own packages whose classes a checkpoint may use, e.g. my_networks"""
 
@@ -438,6 +489,7 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
 class PrepareSettings(RunSettings):
     """Settings of tangent-prepare."""
 
+    # --- performance ---
     shard: str | int | None = None
     """part of the cache for this process, e.g. 3/16; null = all"""
 
@@ -472,33 +524,44 @@ class FineTuningSettings(Settings):
 class TransferSettings(LabelMapSettings, RunSettings):
     """Settings of tangent-transfer."""
 
+    # --- run ---
     name: str = "transfer"
     """folder below runs/transfer; the same name continues an interrupted transfer"""
-    level: Level = 8
-    """level s of the panoramas and of the crops of photos"""
     seeds: OneOrMore[int] | None = None
     """one transfer per seed, e.g. [0, 1, 2]; null = seed"""
     folds: OneOrMore[int] | None = None
     """one transfer per fold, e.g. [1, 2, 3]; null = data.fold, if there are folds"""
+
+    # --- photos ---
+    photos: PhotoSettings
+    """settings of the photos"""
+
+    # --- views ---
+    level: Level = 8
+    """level s of the panoramas and of the crops of photos"""
+
+    # --- network ---
     checkpoint: ExistingPath | None = None
     """network trained on photos (P), which is evaluated and fine-tuned; null = train it"""
     trust: OneOrMore[str] = ()
     """your own packages whose classes a checkpoint may use, e.g. my_networks"""
+
+    # --- training ---
+    fine_tuning: FineTuningSettings
+    """fine-tuning of P on photos (P-FT) and on panoramas (S-FT)"""
+
+    # --- evaluation ---
     compare: OneOrMore[str | Section] = ("erp", "cubemap")
     """further views in which P is evaluated: representations, or settings, e.g. {name: fine,
     option: erp, rows: 1024}"""
     conditions: OneOrMore[str | Section] = ("upright",)
     """conditions of the test: upright, or settings of data, e.g. {name: tilted-45, test_rotation:
     45, upright: auto}"""
-    fine_tuning: FineTuningSettings
-    """fine-tuning of P on photos (P-FT) and on panoramas (S-FT)"""
     study_levels: OneOrMore[Level] | None = None
     """instead of all other stages, evaluate P on panoramas of these levels, e.g. [5, 6, 7, 8, 9,
     10]; null = off"""
     study_max_rows: Rows = 512
     """study_levels: largest number of rows that are read; finer levels are sampled from these"""
-    photos: PhotoSettings
-    """settings of the photos"""
 
 
 SETTINGS: Mapping[str, type[Settings]] = {
@@ -593,24 +656,45 @@ def plain(value: Any) -> Any:
     return [plain(one) for one in value] if isinstance(value, tuple) else value
 
 
-def validate(command: str, config: Any) -> Any:
+def validate(command: str, config: Any, needed: Collection[str] = ()) -> Any:
     """Return the settings of a command as an object of its class.
 
     Args:
         command: Name of the command, e.g. predict.
         config: Settings that Hydra has composed, or a mapping of them.
+        needed: Groups that have to be typed, although they have a default.
 
     Raises:
         SettingError: A setting is missing, unknown, or of another type.
     """
     values: Any = OmegaConf.to_container(OmegaConf.create(config), resolve=True)
     kind = SETTINGS[command]
+    given = {name: v for name, v in values.items() if v != "???" and name not in needed}
     try:
-        return kind.model_validate({name: v for name, v in values.items() if v != "???"})
+        return kind.model_validate(given)
     except ValidationError as error:
-        known = {name: comment_of(field) for name, field in kind.model_fields.items()}
-        inner = [one for one in dotted_names(values) if not is_within(one, kind.not_read)]
-        raise wrong_setting(error, dict.fromkeys(inner, "a value") | known) from error
+        kinds = {".".join(map(str, one["loc"])): one["type"] for one in error.errors()}
+        missing = [f"{name}=" for name, wrong in kinds.items() if wrong == "missing"]
+        if missing and "extra_forbidden" not in kinds.values():  # it may be meant for a missing one
+            text = ", ".join(missing).replace("data=", "data= or experiment=")
+            raise SettingError(f"Missing: {text}. Example: {_example(command)}") from error
+        known = [one for one in dotted_names(values) if not is_within(one, kind.not_read)]
+        raise wrong_setting(error, known) from error
+
+
+def _example(command: str) -> str:
+    """Return the first example in the help of a command."""
+    text = (config_folder() / f"{command}.yaml").read_text("utf-8")
+    found = re.search(rf"^ +(tangent-{command} .*?)(  |$)", text, re.MULTILINE)
+    return found[1] if found else f"tangent-{command} --help"
+
+
+def missing_groups(command: str) -> list[str]:
+    """Return ["data"] if the command line of a run chooses no data set, neither by experiment."""
+    is_own = HydraConfig.get().job.config_name == command  # not that of a resumed run or a stage
+    chosen = any(is_within(name, ("data", "experiment")) for name in typed_names())
+    needs_data = issubclass(SETTINGS[command], RunSettings) and is_own and not chosen
+    return ["data"] * needs_data
 
 
 def typed_settings() -> list[str]:
@@ -626,7 +710,7 @@ def typed_names() -> list[str]:
 
 def is_within(name: str, names: Collection[str]) -> bool:
     """Return True for one of the names, regular expressions, and for a setting of such a group."""
-    return any(re.match(rf"{one}([.@]|$)", name) for one in names)
+    return any(re.match(rf"{one}([.@/]|$)", name) for one in names)
 
 
 def dotted_names(section: Any, prefix: str = "") -> Iterator[str]:

@@ -125,6 +125,6 @@ def shift_range(
             "field of view",
             found=f"{wanted.tolist()}° for an image that spans {widest.tolist()}°",
             expected="a field of view inside the image",
-            remedy="Choose a smaller one, or leave the image out.",
+            remedy="Lower representation.fov_deg, or the rows in representation.dim.",
         )
     return least, np.maximum(least, greatest)

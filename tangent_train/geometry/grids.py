@@ -41,8 +41,8 @@ class PinholeGrid:
         pitch: Distance p of neighboring pixels on the image plane, in focal lengths.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         is_overlapping: True if every direction is inside an image, not only on its outer edge.
-        is_complete: True if the images are known to cover what they are rendered back to; False to
-            check it then.
+        is_complete: True if the images are known to cover the area that is rendered back; False to
+            check the coverage at that time.
 
     Raises:
         SettingError: The rotation is not a rotation, or the size is out of range.
@@ -230,7 +230,7 @@ class PinholeGrid:
         return points[..., :2] / depth / self.pitch + self.camera_matrix[:2, 2]
 
     def insets(self, directions_xyz: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return how far directions are inside the images.
+        """Return the distances of directions from the edges of the images.
 
         Args:
             directions_xyz: ``(n, 3)`` unit vectors.
@@ -396,7 +396,7 @@ class RingGrid(PinholeGrid):
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         valid: ``(H, W)`` pixels of a panorama that the images must cover; None for the sphere.
         by_owners: False if images may be blended with ``feather`` only, see `check_coverage`.
-        is_complete: False for images that do not cover them, or only with those of other grids.
+        is_complete: False for images that do not cover these pixels without other grids.
 
     Raises:
         SettingError: A field of view is out of range, or the images miss a direction.

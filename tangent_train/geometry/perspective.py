@@ -35,7 +35,7 @@ def perspective_grid(
     size: int | Sequence[int],
     roll_deg: Angles = 0.0,
 ) -> PinholeGrid:
-    """Return pinhole images of one camera in some directions; they need not cover the sphere.
+    """Return pinhole images of one camera in given directions, which need not cover the sphere.
 
     Args:
         yaw_deg: Angles to the right of the middle of the panorama.

@@ -51,10 +51,10 @@ def xyz_to_lonlat(directions_xyz: ArrayLike) -> Floats:
 
 
 def to_right_handed(vectors_xyz: ArrayLike) -> Floats:
-    """Return vectors of the sphere's frame, y to the right, with y to the left, and back.
+    """Convert vectors from the frame of the sphere (y right) to that of files (y left), or back.
 
-    All files have the result's frame: point clouds, poses and cameras. Of a matrix that maps
-    vectors of the one frame, it returns the matrix that maps those of the other.
+    Point clouds, poses and cameras are stored in the frame of files. A matrix that maps vectors of
+    one frame is converted to the matrix that maps those of the other.
 
     Args:
         vectors_xyz: ``(..., 3)`` vectors.
@@ -134,7 +134,7 @@ def equirect_shape(level: int) -> tuple[int, int]:
 
 
 def panorama_rows(level: int, rows: int | None) -> int:
-    """Return rows of a panorama; None for those of level s, see `equirect_shape`.
+    """Return the number of rows of a panorama; by default that of level s, see `equirect_shape`.
 
     Raises:
         SettingError: The level or the number is out of range.

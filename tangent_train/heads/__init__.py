@@ -37,6 +37,6 @@ def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:
             return DistanceHead(depth_kind=loaded.depth_kind, **settings)
         head = ClassesHead(loaded.class_names, **settings)
     except ValidationError as error:
-        raise wrong_setting(error, {}) from error
+        raise wrong_setting(error) from error
     head.num_outputs = loaded.network.num_outputs  # with that of no class
     return head

@@ -91,7 +91,7 @@ class PredictedImage(NamedTuple):
 class Head(nn.Module, ABC):
     """The meaning of a network's output.
 
-    A head trains a network (loss and norm), scores it, puts the outputs of views together to a
+    A head trains a network (loss and norm), scores it, merges the outputs of views into a
     panorama, draws the result, and writes and reads its files. Tasks, the engine and the commands
     are the same for all heads. A head without files needs only the first two parts.
 
@@ -105,10 +105,11 @@ class Head(nn.Module, ABC):
         main_score: Score that selects the best epoch.
         num_outputs: Number of channels of the network's output.
         predict_settings: Settings of ``tangent-predict`` that are arguments of the head, each with
-            the kind of output, or the other setting, without which nothing reads it; "" for none.
+            the kind of output or the other setting that it needs; "" for none.
         is_metric: False for distances that are known up to a scale.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind (`source`)
-            holds the predicted pixels, from which pictures are made. All but the last are usual.
+            holds the predicted pixels, from which pictures are drawn. By default, all kinds but
+            the last are written.
         summary: Name of the summary of an image in the summary file.
         summary_columns: Names in the summary of an image that ``summary.csv`` lists.
         unknown: Value of unknown pixels.
@@ -136,14 +137,14 @@ class Head(nn.Module, ABC):
     # Training
 
     def read_data(self, data: Any) -> None:
-        """Take from the data module what the loss needs, such as class weights."""
+        """Read values that the loss needs from the data module, such as class weights."""
 
     def truth(self, labels: Tensor) -> Tensor:
         """Return labels of the data in the form of predictions, e.g. meters instead of steps."""
         return labels
 
     def targets(self, truth: Tensor, ray_lengths: Tensor) -> Tensor:
-        """Return the output of the network that would be correct, for `loss_sum`.
+        """Return the correct output of the network, for `loss_sum`.
 
         Args:
             truth: Result of `truth` for views ``(n, h, w)``.
@@ -157,7 +158,7 @@ class Head(nn.Module, ABC):
 
     @abstractmethod
     def loss_norm(self, targets: Tensor) -> Tensor:
-        """Return the number that the sum of the losses of a step is divided by."""
+        """Return the divisor of the summed losses of a step."""
 
     def auxiliary_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
         """Return the sum of the losses of an auxiliary output, which may be coarser."""
@@ -214,8 +215,8 @@ class Head(nn.Module, ABC):
         Args:
             shape: ``(H, W)`` of the panorama or photo.
             blend: Blend of the views.
-            **settings: ``averaged`` is True if several sets of views are averaged, or more than the
-                pixels is needed; ``device`` is the device of the outputs; ``valid`` is a mask
+            **settings: ``averaged`` is True if several sets of views are averaged, or if more than
+                the pixels is needed; ``device`` is the device of the outputs; ``valid`` is a mask
                 ``(H, W)`` of a partial panorama, else None; ``camera_matrix`` is K of a photo, else
                 None.
 
@@ -236,7 +237,7 @@ class Head(nn.Module, ABC):
     def comparable(
         self, prediction: Tensor, truth: Tensor, ray_lengths: Tensor | None = None
     ) -> Tensor:
-        """Return a prediction as the metric compares it with the truth, e.g. with its scale.
+        """Return a prediction as the metric compares it with the truth, e.g. aligned in scale.
 
         Args:
             prediction: Prediction of a panorama ``(H, W)`` or of crops ``(n, h, w)``.
@@ -272,7 +273,7 @@ class Head(nn.Module, ABC):
         return next(iter(self.suffixes))
 
     def count(self, mosaics: Iterable[Any]) -> str:
-        """Prepare for predictions by those of some images; return a line to print, or ""."""
+        """Prepare for all predictions with those of some images; return a line to print, or ""."""
         return ""
 
     def write_mosaic(self, mosaic: Any, image: Any, files: Mapping[str, Path]) -> None:

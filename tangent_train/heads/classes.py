@@ -43,8 +43,8 @@ _BINS = 256
 class ClassesHead(Head):
     """One of K classes for every pixel; output k of the network is the logit of label k + 1.
 
-    The loss is the cross-entropy, weighted by class. Views are put together by their
-    probabilities. All images are scored in one confusion matrix.
+    The loss is the cross-entropy, weighted by class. The probabilities of overlapping views are
+    averaged. All images are scored in one confusion matrix.
 
     Args:
         class_names: Names of the K + 1 labels, the unknown class first.
@@ -53,8 +53,8 @@ class ClassesHead(Head):
         label_smoothing: Fraction of the target that is spread over all classes.
         absent_class: Treatment of classes absent from the ground truth in the means.
         min_confidence: Predicted pixels with a lower confidence, from 0 to 1, are unknown.
-        min_share: Share of the pixels of each class that is kept at least: lowers
-            `min_confidence` for single classes, see `count`. 0 for the same confidence for all.
+        min_share: Smallest share of the pixels of each class to keep, which lowers
+            `min_confidence` for single classes, see `count`; 0 for one threshold for all.
     """
 
     kind: ClassVar[str] = PIXEL_CLASSES

@@ -82,7 +82,7 @@ class DistanceHead(Head):
         alignment_in: See `DepthProtocol`; None for the quantity in which the network predicts.
         depth_format: Suffix of the depth files without dot: png, npy or exr; None for png.
         depth_scale: Units per meter in PNG files.
-        points: Number of points of an image, at most; None for 500 000.
+        points: Largest number of points of an image; None for 500 000.
         **protocol: Further settings of `DepthProtocol`. Pixels beyond its limits are ignored in
             training too.
 
@@ -156,7 +156,7 @@ class DistanceHead(Head):
         return self.protocol.limited(labels.float() / STEPS_PER_M)
 
     def targets(self, truth: Tensor, ray_lengths: Tensor) -> Tensor:
-        """Return the output that would be correct, see `Head`."""
+        """Return the correct output, see `Head`."""
         return views.from_distance(truth, self.depth_kind, ray_lengths)
 
     def loss_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:

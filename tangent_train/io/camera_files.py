@@ -70,12 +70,7 @@ _Row = tuple[float, float, float]
 _Matrix = tuple[tuple[Annotated[float, Field(gt=0)], float, float], _Row, _Row]
 
 
-def _rotation(matrix: list[list[float]]) -> NDArray[np.float64]:
-    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused
-        return checked_rotation(matrix)
-
-
-_Rotation = Annotated[list[list[float]], AfterValidator(_rotation)]
+_Rotation = Annotated[list[list[float]], AfterValidator(checked_rotation)]
 
 
 class _Source(BaseModel):

@@ -240,23 +240,17 @@ def eye_part(
     Raises:
         DataError: It is stereo and no eye is given, or the other way round.
     """
+    if eye is None:
+        refuse_stereo(path, tags)
+        return slice(None), slice(None)
     stated = tags.get("StereoMode", "").lower()
-    if eye is None and stated not in _MONO:
-        raise DataError(
-            path,
-            found=f"a stereo panorama ({stated}), by its metadata",
-            expected="one picture",
-            remedy="Give eye=left or eye=right to use the picture of one eye.",
-        )
-    for layout in () if eye is None else (stated,) if stated in _LAYOUTS else _UNTAGGED:
+    for layout in (stated,) if stated in _LAYOUTS else _UNTAGGED:
         rows, columns = (n // parts for n, parts in zip(size, _LAYOUTS[layout], strict=True))
         second = (eye == "right") == (layout in _UNTAGGED)
         top, left = (second * n % whole for n, whole in zip((rows, columns), size, strict=True))
         with suppress(DataError):
             read_area(path, (rows, columns), angles, tags=tags)
             return slice(top, top + rows), slice(left, left + columns)
-    if eye is None:
-        return slice(None), slice(None)
     raise DataError(
         path,
         found=f"{width_height(size)}, {stated or 'without stereo metadata'}",
@@ -266,15 +260,16 @@ def eye_part(
     )
 
 
-def refuse_stereo(path: Path) -> None:
-    """Raise DataError if an image of a data set is stereo by its tags."""
-    stated = read_tags(path).get("StereoMode", "").lower()
+def refuse_stereo(path: Path, tags: Mapping[str, str]) -> None:
+    """Raise DataError if an image is stereo by its tags."""
+    stated = tags.get("StereoMode", "").lower()
     if stated not in _MONO:
         raise DataError(
             path,
             found=f"a stereo panorama ({stated}), by its metadata",
             expected="one picture",
-            remedy="Cut out the picture of one eye, from labels and depth too, and remove the tag.",
+            remedy="Give eye=left or eye=right to use the picture of one eye. In data sets, cut it "
+            "out, from labels and depth too, and remove the tag.",
         )
 
 
@@ -331,7 +326,7 @@ def check_resolution(
         DataError: Its pixels would not be square, or it is stereo by its tags.
         SettingError: It has fewer pixels.
     """
-    refuse_stereo(path)
+    refuse_stereo(path, read_tags(path))
     whole = check_area(angles) if angles is None else angles
     rows = read_area(path, size, whole, _SAME_AREA).full_shape[0]
     if size[1] < canvas.image_shape[1] - 1:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -29,9 +28,6 @@ ResultKind = Literal["color", "labels", "depth", "features"]
 
 _TYPES = {"color": "uif", "labels": "bui", "depth": "uif", "features": "uif"}
 _CHANNELS = {"color": ((), (3,)), "labels": ((),), "depth": ((),)}
-
-_GROUP_BYTES = 2**28
-"""Largest size in bytes of the images of channels that are rendered together."""
 
 _NO_DEPTH = 65535
 """Value for missing depth in many 16-bit files, besides 0."""
@@ -235,23 +231,21 @@ class TangentResults:
         Raises:
             SettingError: The format cannot hold the pixels, or `z_depth` is set without depth.
         """
-        suffix, channels = path.suffix.lower(), self.arrays[0].shape[2:]
+        suffix = path.suffix.lower()
         is_lossy = suffix in pixel_files.LOSSY_SUFFIXES and self.kind != "color"
         if is_lossy or (z_depth and self.kind != "depth"):
             setting = "output" if is_lossy else "z_depth"
             expected = "depth with z_depth=true, and png, tif or npy for all but colors"
             raise SettingError(setting, found=f"{self.kind} to {path.name}", expected=expected)
         dtype = self._image_dtype() if suffix != ".npy" else self.arrays[0].dtype
-        pixel_files.check_writable(suffix, dtype, channels[0] if channels else 1)
         arrays = [_distances(array, self.grid) for array in self.arrays] if z_depth else self.arrays
-        whole = (*shape, *channels)
-        if suffix == ".npy":
-            with pixel_files.array_file(path, whole, dtype) as out:
-                self._render(arrays, blend, out)
-        else:
-            panorama = np.empty(whole, arrays[0].dtype)
-            self._render(arrays, blend, panorama)
-            pixel_files.write_pixels(path, panorama.astype(dtype, copy=False))
+        interpolation: Interpolation = "bilinear"
+        if self.kind in ("labels", "depth"):
+            interpolation, blend = "nearest", "nearest"
+        panorama: NDArray[Any] = rendering.tangent_to_equirect(
+            np.stack(arrays), self.grid, shape, blend, interpolation
+        )
+        pixel_files.write_pixels(path, panorama.astype(dtype, copy=False))
         pairs = zip(self.arrays, arrays, strict=True) if z_depth else ()
         return sum(int(((after == 0) & (before % _NO_DEPTH != 0)).sum()) for before, after in pairs)
 
@@ -261,21 +255,6 @@ class TangentResults:
             values = [int(value) for array in self.arrays for value in (array.min(), array.max())]
             return np.result_type(*map(np.min_scalar_type, (min(values), max(values))))
         return np.dtype(np.float32) if dtype.kind == "f" else dtype
-
-    def _render(self, arrays: Sequence[NDArray[Any]], blend: Blend, out: NDArray[Any]) -> None:
-        grid = self.grid
-        shape = (out.shape[0], out.shape[1])
-        if self.kind in ("labels", "depth"):
-            out[:] = rendering.tangent_to_equirect(
-                np.stack(arrays), grid, shape, interpolation="nearest"
-            )
-            return
-        channels = out.shape[2:]
-        step = max(1, _GROUP_BYTES // (4 * grid.num_images * math.prod(grid.size)))
-        for start in range(0, channels[0], step) if channels else (0,):
-            part = (..., slice(start, start + step)) if channels else ...
-            group = np.stack([array[part] for array in arrays])
-            out[part] = rendering.tangent_to_equirect(group, grid, shape, blend)
 
 
 def _kind_of(file: Path, array: NDArray[Any]) -> ResultKind:

@@ -31,7 +31,6 @@ _SKEW = 0.02
 """Entries of a display matrix may differ from a quarter turn by this: one degree."""
 _SQUARE = 0.01
 """Pixels are square up to this rounding of their aspect ratio."""
-_MOST_ASPECT = 16
 _PQ, _HLG = 16, 18  # transfer functions of Rec. ITU-R BT.2100
 _SRGB: dict[str, Any] = {"dst_color_trc": 13, "dst_color_primaries": 1}
 _PROJECTIONS = {1: "a cube map", 3: "half a sphere", 5: "a fisheye picture"}
@@ -229,7 +228,7 @@ def _display(path: Path, stream: Any, frame: Any) -> _Display:
     and HLG are converted to sRGB, where white is 203 cd/m² (Rec. ITU-R BT.2408).
 
     Raises:
-        DataError: It is rotated by other angles than quarter turns, or its pixels are too long.
+        DataError: It is rotated by other angles than quarter turns.
     """
     signs, options, data = _UPRIGHT_SIGNS, {}, frame.side_data.get("DISPLAYMATRIX")
     if data is not None:
@@ -245,11 +244,6 @@ def _display(path: Path, stream: Any, frame: Any) -> _Display:
                 remedy="Export it again without rotation.",
             )
     aspect = float(stream.sample_aspect_ratio or 1)
-    if not 1 / _MOST_ASPECT <= aspect <= _MOST_ASPECT:
-        found = f"pixels {aspect:.3g} times as wide as high"
-        raise DataError(
-            path, found=found, expected=f"at most {_MOST_ASPECT} times, or a {_MOST_ASPECT}th"
-        )
     if abs(aspect - 1) > _SQUARE:
         options["width"] = round(frame.width * max(aspect, 1))
         options["height"] = round(frame.height / min(aspect, 1))

@@ -44,9 +44,6 @@ _REPEAT_RATIO = 1.15
 _REPEAT_COSINE = np.cos(np.deg2rad(20))
 """Two detections closer than this in position, size and orientation are one keypoint."""
 
-_ROWS = 512
-"""Number of left descriptors whose distances are computed at once."""
-
 
 @dataclass(frozen=True, eq=False)
 class SphericalKeypoints:
@@ -248,26 +245,16 @@ def match(
     left, right = left_descriptors, right_descriptors
     if not (len(left) and len(right)):
         return np.empty((0, 2), np.int64)
-    nearest, first, second = _nearest_two(left, right)
-    chosen = np.flatnonzero(first < ratio**2 * second) if ratio < 1 else np.arange(len(left))
+    squares, nearest = _cv2.batchDistance(
+        left, right, cv2.CV_32F, normType=cv2.NORM_L2SQR, K=min(2, len(right))
+    )
+    chosen = np.arange(len(left))
+    if ratio < 1 < len(right):
+        chosen = np.flatnonzero(squares[:, 0] < ratio**2 * squares[:, 1])
+    pairs = np.stack([chosen, nearest[chosen, 0]], axis=1).astype(np.int64)
     if mutual and len(chosen):
-        chosen = chosen[_nearest_two(right[nearest[chosen]], left)[0] == chosen]
-    return np.stack([chosen, nearest[chosen]], axis=1)
-
-
-def _nearest_two(
-    left: NDArray[np.float32], right: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], Floats, Floats]:
-    """Return ``(n,)`` index and squared distance of the nearest, squared distance of the second."""
-    nearest = np.empty(len(left), np.int64)
-    first, second = np.empty((2, len(left)))
-    squares = np.einsum("nd,nd->n", right, right)
-    for start in range(0, len(left), _ROWS):
-        rows = slice(start, start + _ROWS)
-        part = left[rows]
-        distances = squares + np.einsum("nd,nd->n", part, part)[:, None] - 2 * part @ right.T
-        best = np.arange(len(part)), distances.argmin(axis=1)
-        nearest[rows], first[rows] = best[1], distances[best]
-        distances[best] = np.inf
-        second[rows] = distances.min(axis=1)
-    return nearest, np.maximum(first, 0), np.maximum(second, 0)
+        _, back = _cv2.batchDistance(
+            right[pairs[:, 1]], left, cv2.CV_32F, normType=cv2.NORM_L2SQR, K=1
+        )
+        pairs = pairs[back[:, 0] == chosen]
+    return pairs

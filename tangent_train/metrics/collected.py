@@ -50,8 +50,8 @@ class ImagesMetric(Metric):
 class SegmentationMetric(ImagesMetric):
     """Counts the pixels of all images of a data set, see `SegmentationCounts`.
 
-    Pixels are integer counts. Equirectangular pixels over-count the poles; in the matrix of solid
-    angles each pixel has the weight of its solid angle. Counts are summed over processes.
+    Pixels are counted as integers. Equirectangular pixels over-count the poles, so each pixel has
+    the weight of its solid angle in the matrix of solid angles. Counts are summed over processes.
 
     Args:
         num_classes: K + 1, the unknown class 0 included.

@@ -6,16 +6,15 @@ import math
 from typing import Any
 
 import lightning
-from torch import Tensor
 
 from tangent_train.errors import SettingError
 
 _NAMED = 5
-"""Images and tensors that a message names, at most."""
+"""Images that a message names, at most."""
 
 
 def check_loss(task: lightning.LightningModule, loss: float, batch: Any) -> None:
-    """Stop training at a loss that is not finite, and name its cause.
+    """Stop training at a loss that is not finite, and name the images.
 
     Args:
         task: Task with the weights before the step.
@@ -25,16 +24,10 @@ def check_loss(task: lightning.LightningModule, loss: float, batch: Any) -> None
     Raises:
         SettingError: The loss is NaN or infinite.
     """
-    if math.isfinite(loss):
-        return
-    cause = "finite images and weights"
-    if not batch.images.isfinite().all():
-        cause = "images with NaN or infinite values"
-    elif broken := _broken_tensors(task):
-        cause = f"weights that were not finite before: {broken}"
-    data: Any = task.trainer.datamodule  # type: ignore[attr-defined]
-    names = [data.dataset("train").name(index) for index in batch.index.tolist()]
-    _stop(task, "loss of", f"{loss}, from {cause}", *names)
+    if not math.isfinite(loss):
+        data: Any = task.trainer.datamodule  # type: ignore[attr-defined]
+        names = [data.dataset("train").name(index) for index in batch.index.tolist()]
+        _stop(task, "loss of", str(loss), *names)
 
 
 def check_weights(task: lightning.LightningModule) -> None:
@@ -43,18 +36,10 @@ def check_weights(task: lightning.LightningModule) -> None:
     Raises:
         SettingError: A weight is NaN or infinite.
     """
-    if broken := _broken_tensors(task):
-        _stop(task, "weights after", f"NaN or infinite values in {broken}")
-
-
-def _broken_tensors(task: lightning.LightningModule) -> str:
-    """Return names of tensors with NaN or infinite weights; buffers may hold infinities."""
-
-    def is_broken(tensor: Tensor) -> bool:
-        return not (tensor.isfinite() if tensor.requires_grad else ~tensor.isnan()).all()
-
-    tensors = (*task.named_parameters(), *task.named_buffers())
-    return ", ".join([name for name, tensor in tensors if is_broken(tensor)][:_NAMED])
+    for name, tensor in (*task.named_parameters(), *task.named_buffers()):
+        # Buffers may hold infinities.
+        if not (tensor.isfinite() if tensor.requires_grad else ~tensor.isnan()).all():
+            _stop(task, "weights after", f"NaN or infinite values in {name}")
 
 
 def _stop(task: lightning.LightningModule, subject: str, found: str, *names: str) -> None:

@@ -248,7 +248,7 @@ class Task(lightning.LightningModule, ABC):
         return self._trainer is not None and self._trainer.testing
 
     def on_validation_epoch_start(self) -> None:
-        """Start to count."""
+        """Reset the metric."""
         self._sums = torch.zeros(3, device=self.device)
 
     def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
@@ -331,7 +331,7 @@ class PixelTask(Task):
 
     The views of all images of a batch, on all processes, contribute to one gradient (paper,
     supplement, "Semantic segmentation"). Validation and test cover the whole sphere, or the whole
-    photo; the outputs are put together and compared with the original labels.
+    photo; the outputs are merged and compared with the original labels.
 
     The network is a module ``(B, C, h, w) -> (B, K, h, w)``, or one that returns a dict with this
     output under ``"out"`` and optionally that of an auxiliary head under ``"aux"``. A network whose
@@ -383,7 +383,7 @@ class PixelTask(Task):
 
         Args:
             outputs: Outputs of the network by name, see `forward`.
-            targets: The output that would be correct, see `Head.targets`.
+            targets: Correct outputs, see `Head.targets`.
         """
         loss = self.head.loss_sum(outputs["out"], targets)
         if "aux" not in outputs or not self.training:

@@ -61,7 +61,7 @@ def _class_of(section: Mapping[str, Any]) -> str:
 
 
 def test_every_experiment_of_the_field_has_a_protocol_and_is_documented() -> None:
-    page = (ROOT / "docs" / "how-to" / "field_benchmarks.md").read_text()
+    page = (ROOT / "docs" / "reference" / "protocols.md").read_text()
     assert PROTOCOLS.keys() == FILES == set(re.findall(r"(?<=`)field/\w+(?=`)", page))
 
 

@@ -90,7 +90,9 @@ def test_weights_beside_an_onnx_file_are_written_into_it(here: Path, run: Run) -
 
 def test_an_import_without_a_trained_network_is_explained(here: Path, run: Run) -> None:
     del here
-    with pytest.raises(SystemExit, match=r"weights: .* a trained network.*hexunet.*tangent-train"):
+    with pytest.raises(
+        SystemExit, match=r"weights: .* a trained network.*Example: tangent-import library="
+    ):
         run("import", "network=unet", "network.widths=[4,8]")
 
 

@@ -173,10 +173,9 @@ def test_distances_beyond_the_integers_are_unknown_and_counted(
 
 @pytest.mark.parametrize(("dim", "blend"), [(32, "nearest"), (16, "feather")])
 def test_features_of_another_resolution(
-    rendered: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: Patch
+    rendered: Path, tmp_path: Path, dim: int, blend: str
 ) -> None:
     """Features that are the directions of their pixels, written by hand, come back in place."""
-    monkeypatch.setattr("tangent_train.io.tangent_folders._GROUP_BYTES", 200_000)
     content = json.loads((rendered / "cameras.json").read_text())
     (tmp_path / "features").mkdir()
     edge = np.tan(np.radians(content["camera"]["fov_deg"] / 2))

@@ -15,7 +15,7 @@ from tests.cli.tiny_runs import run_command
 from tests.config.test_settings import GIVEN
 from tests.running import Capture, Patch, composed_settings, run_python
 
-UNREAD = r"expected no such setting: tangent-evaluate does not read it\."
+UNREAD = "expected no such setting: tangent-evaluate does not read it."
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +33,7 @@ def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
         ("train batch_size=2", "Did you mean data.batch_size?"),
         ("predict data.batch_size=2 input=x", "Did you mean view_batch_size?"),
         ("train trainer.epochs=2", "Did you mean trainer.max_epochs?"),
-        ("evaluate optimizer.learning_rate=2", "expected a known setting."),
+        ("evaluate optimizer.learning_rate=2", UNREAD),
         ("train model=unet", "Did you mean network?"),
         ("predict +level=5", "Did you mean levels?"),
         ("train save_dir=x", "Did you mean hydra.run.dir?"),
@@ -58,8 +58,13 @@ def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
         ("train data=5", "data: found 5; expected one of cityscapes, densepass, "),
         (
             "train debug=true",
-            "debug: found True; expected one of fast, limit, overfit, profile, or ~debug.",
+            "debug: found true; expected one of fast, limit, overfit, profile, or ~debug.",
         ),
+        ("train -m debug=true,false", "debug: found true,false; expected one of fast, limit, "),
+        ("train network=[1]", "network: found [1]; expected one of deeplabv3_mobilenet, "),
+        ("predict debug=true", "debug: found a value; .*tangent-predict does not read it."),
+        ("predict representation=erp", "tangent-predict does not read it. Did you mean views?"),
+        ("evaluate recipe=true", UNREAD),
         ("check callbacks=null", "callbacks: found null; .*, or ~callbacks."),
         ("keypoints a.jpg b.jpg", "mean left=a.jpg right=b.jpg?"),
         ("keypoints holiday out", "mean input=holiday output=out?"),
@@ -121,7 +126,9 @@ def test_jobs_of_a_sweep_resolve_interpolations(tmp_path: Path, monkeypatch: Pat
     ],
 )
 def test_an_evaluation_refuses_settings_of_a_training(setting: str, monkeypatch: Patch) -> None:
-    with pytest.raises(SystemExit, match=f"{setting.partition('=')[0]}: found a value; {UNREAD}"):
+    with pytest.raises(
+        SystemExit, match=f"{setting.partition('=')[0]}: found a value; {re.escape(UNREAD)}"
+    ):
         run_command(monkeypatch, "evaluate", "checkpoint=.", "data=synthrooms", setting)
 
 
@@ -151,4 +158,33 @@ def test_the_package_lists_its_commands(monkeypatch: Patch, capsys: Capture) -> 
 def test_modules_run_as_commands(tmp_path: Path) -> None:
     done = run_python(tmp_path, "-m", "tangent_train.cli.export", "output=x.onnx")
     assert done.returncode == 1
-    assert done.stderr.startswith("tangent-export: checkpoint: found nothing; expected network")
+    example = "tangent-export checkpoint=<run>/checkpoints/best.ckpt output=model.onnx"
+    assert done.stderr == f"tangent-export: Missing: checkpoint=. Example: {example}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "missing"),
+    [
+        ("predict", "checkpoint=, input=, output="),
+        ("predict output=x rotations=0", "checkpoint=, input="),
+        ("keypoints", "output="),
+        ("train", "data= or experiment="),
+        ("train -m seed=1,2", "data= or experiment="),
+        ("evaluate level=5", "data= or experiment=, checkpoint="),
+        ("transfer", "data= or experiment="),
+    ],
+)
+def test_missing_settings_are_named_together_with_an_example(
+    words: str, missing: str, monkeypatch: Patch, tmp_path: Path
+) -> None:
+    command, *arguments = words.split()
+    expected = f"^tangent-{command}: Missing: {missing}. Example: tangent-{command} [^\n]*=[^\n]*$"
+    with pytest.raises(SystemExit, match=expected):
+        run_command(monkeypatch, command, *arguments)
+    assert not [*tmp_path.rglob("rooms")]
+
+
+@pytest.mark.parametrize("word", ["help", "--hlep", "-help", "--halp"])
+def test_words_that_mean_help_print_it(word: str, monkeypatch: Patch, capsys: Capture) -> None:
+    run_command(monkeypatch, "export", word)
+    assert capsys.readouterr().out.startswith("Write a trained network for other programs")

@@ -6,13 +6,15 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml  # type: ignore[import-untyped]
 from omegaconf import OmegaConf
 
 from tangent_train.config.help import annotate, command_settings, description, read_settings
 from tangent_train.config.settings import SETTINGS
 from tangent_train.errors import SettingError
 from tangent_train.files import config_folder
-from tests.running import command_of, composed, composed_settings, run_python
+from tests.cli.tiny_runs import run_command
+from tests.running import Capture, Patch, command_of, composed, composed_settings, run_python
 
 CONFIGS = config_folder()
 EXPERIMENTS = sorted(
@@ -71,7 +73,7 @@ def test_a_recipe_sets_what_the_task_has(task: str) -> None:
         ("train", ["seed=abc"], r"^seed: found abc; expected a valid integer"),
         ("train", ["+sed=1"], r"^sed: found 1; expected a known setting\. Did you mean seed\?"),
         ("export", ["checkpoint=none.ckpt", "output=x"], r"^checkpoint: found none\.ckpt; .*exist"),
-        ("export", [f"checkpoint={CONFIGS}"], r"^output: found nothing; expected file: \.onnx"),
+        ("export", [f"checkpoint={CONFIGS}"], "^Missing: output=. Example: tangent-export checkp"),
         ("train", ["level=20"], r"^level: found 20; .*less than or equal to 14"),
         ("predict", [*GIVEN["predict"], "levels=[9,20]"], "^levels: found 20; .*equal to 14"),
         ("keypoints", ["output=x", "pairing=some"], "^pairing: .*'consecutive' or 'all'"),
@@ -116,9 +118,60 @@ def explained(command: str, *overrides: str) -> str:
     return annotate("== Settings ==\n" + OmegaConf.to_yaml(composed(command, *overrides)), command)
 
 
-@pytest.mark.parametrize("command", ["check", "predict", "train", "transfer"])
-def test_help_explains_every_line(command: str) -> None:
-    assert [line for line in explained(command).splitlines()[1:] if " # " not in line] == []
+def unexplained(text: str) -> list[str]:
+    """Lines of the settings in a help text without a comment beside or below them."""
+    joined = re.sub(r"\n {32}# ", " # ", text)
+    lines = [line for line in joined.splitlines()[1:] if line and not line.startswith("# ---")]
+    return [line for line in lines if " # " not in line]
+
+
+def by_heading(command: str) -> dict[str, list[str]]:
+    """Names of settings in a help text by the heading above them."""
+    parts = re.split("^# --- (.*) ---$", explained(command), flags=re.MULTILINE)[1:]
+    names = [re.findall(r"^(\w+):", text, re.MULTILINE) for text in parts[1::2]]
+    return dict(zip(parts[::2], names, strict=True))
+
+
+@pytest.mark.parametrize("command", SETTINGS)
+def test_help_explains_every_line_in_100_columns(
+    command: str, monkeypatch: Patch, capsys: Capture
+) -> None:
+    run_command(monkeypatch, command, "--help")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if len(line) > 100] == []
+    template = (CONFIGS / f"{command}.yaml").read_text("utf-8").splitlines()
+    examples = [line[6:] for line in template if line.startswith(f"{' ' * 8}tangent-")]
+    assert examples == [line for line in lines if line.startswith("  tangent-")]
+    assert unexplained(explained(command)) == []
+
+
+@pytest.mark.parametrize("command", SETTINGS)
+def test_help_prints_all_settings_under_headings_the_required_ones_first(command: str) -> None:
+    config = OmegaConf.to_container(composed(command))
+    assert yaml.safe_load(explained(command).partition("\n")[2]) == config
+    headings = by_heading(command)
+    required = {
+        name
+        for name, field in SETTINGS[command].model_fields.items()
+        if field.is_required() and not (CONFIGS / name).is_dir()
+    } - {"photos", "fine_tuning"}
+    assert set(headings.get("required", ())) == required
+    assert not required or next(iter(headings)) == "required"
+    assert "other" not in headings
+    assert sum(map(len, headings.values())) == len(config)
+
+
+def test_headings_of_help_are_those_of_the_settings() -> None:
+    found = by_heading("predict")
+    assert [*found] == [
+        *("required", "network", "input", "classes", "views", "output", "performance")
+    ]
+    assert found["required"] == ["checkpoint", "input", "output"]
+    assert "rotations" in found["views"]
+    assert "write" in found["output"]
+    assert "device" in found["performance"]
+    assert by_heading("evaluate")["classes"] == ["label_map", "unmapped"]
+    assert by_heading("train")["views"] == ["level", "representation"]
 
 
 def test_settings_of_one_name_are_explained_apart() -> None:
@@ -138,7 +191,7 @@ def test_settings_of_one_name_are_explained_apart() -> None:
         ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "levl=5", "Did you mean level?"),
         ("train", "resume=nowhere", "nowhere: found no config.yaml"),
-        ("export", "output=x.onnx", "checkpoint: found nothing; expected network"),
+        ("export", "output=x.onnx", "tangent-export: Missing: checkpoint=. Example: "),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
     ],
 )

@@ -86,9 +86,9 @@ def test_a_field_of_view_replaces_the_camera_files(root: Path) -> None:
     np.testing.assert_allclose(np.rad2deg(2 * np.arctan(64 / matrix[0, 0])), 48.7)
 
 
-def test_square_crops_are_refused_with_the_rows_that_fit(root: Path) -> None:
+def test_square_crops_are_refused(root: Path) -> None:
     """A crop of 45° is higher than the photo, which is 26° high."""
-    with pytest.raises(SettingError, match=r"spans .48.7, 25.47.°.*representation\.dim=\[17,32\]"):
+    with pytest.raises(SettingError, match=r"spans .48.7, 25.47.°.*representation\.dim"):
         photos(root, PerspectiveRepresentation(level=6)).setup()
     photos(root, PerspectiveRepresentation(level=6, dim=[17, 32])).setup()
 

@@ -319,14 +319,6 @@ def test_the_eyes_of_matroska(tmp_path: Path, mode: str) -> None:
     assert read_video_tags(_write(tmp_path / "a.mkv", setup=setup)) == {"StereoMode": mode}
 
 
-def test_endless_pixels_are_refused(tmp_path: Path) -> None:
-    def setup(stream: Any) -> None:
-        stream.codec_context.sample_aspect_ratio = Fraction(30, 1)
-
-    with pytest.raises(DataError, match=r"found pixels 30 times as wide as high"):
-        read_video_size(_write(tmp_path / "a.mp4", setup=setup))
-
-
 def _pq_nits(signal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Display light in cd/m² (SMPTE ST 2084)."""
     power = signal ** (32 / 2523)

@@ -98,7 +98,7 @@ def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
     write_cameras(tmp_path, {"a": [[80, 0, 5], [0, 80, 55], [0, 0, 1]]})
     assert _only(tmp_path, "a").camera_matrix.tolist() == [[80, 0, 5], [0, 80, 55], [0, 0, 1]]
     write_cameras(tmp_path, {"a": [[80, 0, 55], [0, 80, 5], [0, 0, 1]]})
-    message = r"cameras\.json: found .* cx = 55, cy = 5 for a; .* inside 40 × 60 pixels"
+    message = r"a\.jpg: found cx = 55, cy = 5; .* inside 40 × 60 pixels"
     with pytest.raises(DataError, match=message):
         _photos(tmp_path).setup()
 

@@ -54,7 +54,7 @@ def _options(kind: Any, **settings: Any) -> Any:
 
 
 def _reconstruct(project: Path) -> None:
-    """The commands of docs/how-to/colmap.md, in Python and with one thread."""
+    """The commands of docs/how-to/keypoints.md, in Python and with one thread."""
     database = project / "database.db"
     pycolmap.set_random_seed(0)
     pycolmap.extract_features(
