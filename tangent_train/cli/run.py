@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,7 @@ class Run:
         task: Task.
         loaded: Network from a file; None if the network is built from the settings.
         notes: Notes on the label map of that network.
+        facts: Further facts of the protocol.
     """
 
     folder: Path
@@ -79,6 +80,7 @@ class Run:
     task: Any
     loaded: LoadedNetwork | None = None
     notes: Sequence[str] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     def trainer(self, callbacks: Sequence[Callback] = ()) -> lightning.Trainer:
         """Build the trainer of the config, with further callbacks, and log the settings."""
@@ -139,7 +141,7 @@ class Run:
             for place, index in enumerate(gathered_order(tested, trainer.world_size)):
                 for group in data.groups(items[index]):
                     groups[group].append(place)
-            self._report(checkpoint, groups, trainer.callbacks)  # type: ignore[attr-defined]
+            self.report(checkpoint, groups, trainer.callbacks)  # type: ignore[attr-defined]
             return
         text = f"{tested} of {len(items)} test {data.noun} were evaluated: no results are written."
         rank_zero_only(print_text)(text)
@@ -168,7 +170,7 @@ class Run:
         )
 
     @rank_zero_only
-    def _report(
+    def report(
         self, checkpoint: Path, groups: Mapping[str, list[int]], callbacks: Sequence[Callback]
     ) -> None:
         """Write the results, with the scores of each group of images (`DataModule.groups`)."""
@@ -183,7 +185,7 @@ class Run:
                 | evaluation.plain_scores(head.scores_of(task.result, places))
                 for group, places in sorted(groups.items())
             ],
-            protocol={**data.facts, **head.facts},
+            protocol={**data.facts, **head.facts, **self.facts},
             checkpoint=name,
             label_map=self.settings.model_dump(mode="json").get("label_map"),
             folds=data.folds,
