@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.label_map import LabelMap, read_label_map
@@ -22,11 +23,13 @@ from tangent_train.config.settings import EvaluateSettings, refuse_typed
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted, width_height
 from tangent_train.geometry.sphere import check_area
+from tangent_train.heads.pictures import evenly_spread
 from tangent_train.io.gpano import read_area
 from tangent_train.io.image_files import composed, walk_files
 from tangent_train.io.pixel_files import read_depth_m, read_image_size
 from tangent_train.progress import show_progress
 from tangent_train.rendering.resampling import resize
+from tangent_train.results.tables import score_text
 from tangent_train.threads import in_threads
 
 OF_FILES = ("values", "files", "resample", "depth_scale", "depth_channel")
@@ -41,6 +44,13 @@ _ARRAYS = (".npy", ".npz")
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".exr", *_ARRAYS)
 _NO_CLASS = (255, 65535)
 _NAMED = 10
+_COMPARED = 8
+_MISTAKES: dict[str, Callable[[Tensor], Tensor]] = {
+    "mirrored left to right": lambda pixels: pixels.flip(1),
+    "upside down": lambda pixels: pixels.flip(0),
+    "shifted by half the width": lambda pixels: pixels.roll(pixels.shape[1] // 2, 1),
+}
+"""Usual mistakes in the orientation of predictions."""
 
 
 def score_files(settings: EvaluateSettings, folder: Path) -> None:
@@ -63,15 +73,20 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     pictures = Pictures(folder / "panels", settings.panels)
     task = SimpleNamespace(head=head, representation=data.representation)
     groups: dict[str, list[int]] = defaultdict(list)
+    variants = {name: head.build_metric() for name in ("as they are", *_MISTAKES)}
+    compared = evenly_spread(_COMPARED, len(scored.indices))
 
     def score() -> Iterator[None]:
-        for index, found in in_threads(scored.read, scored.indices):
+        for place, (index, found) in enumerate(in_threads(scored.read, scored.indices)):
             if found is not None:
                 for group in data.groups(scored.items[index]):
                     groups[group].append(len(scored.done))
                 truth, prediction = map(torch.from_numpy, found)
                 comparable = head.comparable(prediction, head.truth(truth))
                 metric.update(comparable, head.truth(truth))
+                for name, of_variant in variants.items() if place in compared else ():
+                    turned = _MISTAKES.get(name, torch.clone)(prediction)
+                    of_variant.update(head.comparable(turned, head.truth(truth)), head.truth(truth))
                 pictures.draw(task, data.dataset("test"), index, truth, comparable)
                 scored.done.append(index)
             yield
@@ -86,10 +101,29 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
             remedy="Or give files=, a CSV file with the columns image and prediction.",
         )
     task.result, task.evaluated = metric.compute(), len(scored.done)
+    _warn_of_mistakes(head, variants)
     settings = settings.model_copy(update={"representation": {"erp_height": data.erp_height}})
     run = Run(folder, settings, data, task, facts=scored.facts)
     run.write_settings()
     run.report(settings.predictions, groups, [pictures])
+
+
+def _warn_of_mistakes(head: Any, variants: Mapping[str, Any]) -> None:
+    """Print a warning if predictions fit better when they are turned over."""
+    column = head.columns[head.main_score]
+    scores = {
+        name: head.scores(metric.compute()).means[head.main_score]
+        for name, metric in variants.items()
+    }
+    best = min if column.better == "lower" else max
+    name = best(scores, key=lambda name: scores[name])
+    if name != "as they are":
+        found, usual = (score_text(scores[n], column.unit) for n in (name, "as they are"))
+        print_text(
+            f"Warning: {name}, predictions score {column.text} {found} instead of {usual} on up to "
+            f"{_COMPARED} images. Do they have the orientation of the images?",
+            error=True,
+        )
 
 
 def _data(settings: EvaluateSettings, rows: int | None) -> Any:

@@ -147,6 +147,26 @@ def test_files_are_matched_by_a_list(data: Any, run: Run, tmp_path: Path) -> Non
     assert (found["images"], found["scores"]["miou"]) == (3, 1)
 
 
+@pytest.mark.parametrize(
+    ("turn", "name"),
+    [
+        (lambda labels: labels, None),
+        (lambda labels: labels[:, ::-1], "mirrored left to right"),
+        (lambda labels: labels[::-1], "upside down"),
+        (lambda labels: np.roll(labels, 32, axis=1), "shifted by half the width"),
+    ],
+)
+def test_turned_predictions_are_noticed(
+    data: Any, run: Run, tmp_path: Path, capsys: Capture, turn: Any, name: str | None
+) -> None:
+    for path, truth in data.items():
+        _save(tmp_path / "maps" / f"{path}.png", turn(truth))
+    _scores(run, tmp_path, "found")
+    error = capsys.readouterr().err
+    assert ("Warning" in error) == (name is not None)
+    assert name is None or f"{name}, predictions score mIoU 100.0 instead of" in error
+
+
 def test_distances(data: Any, run: Run, tmp_path: Path) -> None:
     """10 % too far: AbsRel is 0.1, by any weighting."""
     for name in (*data, "hall/3"):
