@@ -64,6 +64,7 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
         SettingError: A setting does not suit the data, or is that of a network.
         DataError: No prediction can be used.
     """
+    predictions: Any = settings.predictions
     refuse_typed(_OF_NETWORKS, "nothing: predictions= is scored without a network")
     rows = (settings.representation or {}).get("erp_height")
     data = _data(settings, rows)
@@ -105,7 +106,7 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     settings = settings.model_copy(update={"representation": {"erp_height": data.erp_height}})
     run = Run(folder, settings, data, task, facts=scored.facts)
     run.write_settings()
-    run.report(settings.predictions, groups, [pictures])
+    run.report(predictions, groups, [pictures])
 
 
 def _warn_of_mistakes(head: Any, variants: Mapping[str, Any]) -> None:
@@ -211,9 +212,9 @@ class ScoredFiles:
         found = {}
         for item in self.items:
             keys = [item.name, *[composed(item.rgb.stem)] * (stems[item.rgb.stem] == 1)]
-            path = next((next(iter(paths[key])) for key in keys if len(paths[key]) == 1), None)
-            if path is not None:
-                found[item.name] = path
+            matches = [paths[key] for key in keys if len(paths[key]) == 1]
+            if matches:
+                (found[item.name],) = matches[0]
         return found, sorted({*files} - {*found.values()})
 
     def _label_map(self) -> LabelMap:

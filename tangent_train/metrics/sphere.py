@@ -20,7 +20,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_solid_angles
@@ -34,8 +33,8 @@ BOUNDARY_DEG = 1.0
 """Width of the boundaries of classes, in degrees; at least one pixel."""
 
 
-def row_weights(height: int) -> Float[np.ndarray, "regions height"]:
-    """Return the solid angles of the rows of the first two of `REGIONS`."""
+def row_weights(height: int) -> NDArray[np.float64]:
+    """Return the solid angles ``(2, H)`` of the rows of the first two of `REGIONS`."""
     latitudes_deg = np.abs(90 - (2 * np.arange(height) + 1) * 90 / height)
     rows = np.stack([latitudes_deg > 90 - _CAP_DEG, latitudes_deg < _CAP_DEG])
     return rows * equirect_solid_angles((height, 2 * height))
@@ -49,7 +48,7 @@ def beside_seam(width: int) -> NDArray[np.intp]:
 
 def seam_sums(
     predicted: NDArray[Any], true: NDArray[Any], known: NDArray[np.bool_]
-) -> Float[np.ndarray, " sums"]:
+) -> NDArray[np.float64]:
     """Sum the disagreement of neighbors in a row, see `seam_step`.
 
     Args:
@@ -58,7 +57,8 @@ def seam_sums(
         known: True where both pixels of a pair are known.
 
     Returns:
-        Predicted and true disagreement and weight of the pairs across the seam; those of others.
+        ``(6,)`` predicted and true disagreement and weight of the pairs across the seam; those of
+        others.
     """
     angles = equirect_solid_angles(known.shape)
     across, others = [], []
@@ -69,8 +69,8 @@ def seam_sums(
     return np.array([*across, *others])
 
 
-def seam_step(sums: Float[np.ndarray, "*some sums"]) -> NDArray[np.float64]:
-    """Return the seam step, given results of `seam_sums`; NaN without known pairs."""
+def seam_step(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the seam step, given results ``(…, 6)`` of `seam_sums`; NaN without known pairs."""
     parts = sums.reshape(*sums.shape[:-1], 2, 3)
     excess = (parts[..., 0] - parts[..., 1]) / np.where(parts[..., 2] > 0, parts[..., 2], np.nan)
     step: NDArray[np.float64] = excess[..., 0] - excess[..., 1]
@@ -107,8 +107,10 @@ def near_boundary(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
         reach = int(across[top])
         beside = (0, 0, reach, reach, cv2.BORDER_WRAP)
         wide = [cv2.copyMakeBorder(part[top:bottom], *beside) for part in (alone, pairs)]
-        window, how = (2 * reach, 1), {"anchor": (reach, 0), "normalize": False}
-        near[top:bottom] = cv2.boxFilter(wide[1], cv2.CV_32S, window, **how)[:, reach:-reach]
+        counts = cv2.boxFilter(
+            wide[1], cv2.CV_32S, (2 * reach, 1), anchor=(reach, 0), normalize=False
+        )
+        near[top:bottom] = counts[:, reach:-reach]
         near[top:bottom] |= wide[0][:, 2 * reach :].view(np.bool_)
     return near
 
@@ -124,8 +126,8 @@ def _reach(height: int, width: int) -> tuple[int, NDArray[np.intp]]:
 
 def boundary_sums(
     prediction: NDArray[np.uint8], truth: NDArray[np.uint8], num_classes: int
-) -> Float[np.ndarray, "3 classes"]:
-    """Return the steradians of each class near its boundaries: true, predicted, and both.
+) -> NDArray[np.float64]:
+    """Return the steradians ``(3, K)`` of classes near boundaries: true, predicted, and both.
 
     Args:
         prediction: ``(H, W)`` labels.
