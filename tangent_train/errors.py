@@ -94,6 +94,16 @@ def counted(count: int, plural: str) -> str:
     return f"{count} {plural.removesuffix('s') if count == 1 else plural}"
 
 
+def listed(names: Sequence[object], most: int = 25) -> str:
+    """Return names for a message: the first ones, and the number of the others.
+
+    >>> listed(["wall", "floor"]), listed(range(150), 3)
+    ('wall, floor', '0, 1, 2, … 147 more')
+    """
+    more = f", … {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(map(str, names[:most])) + more
+
+
 def first_line(error: object) -> str:
     """Return the first line of an error's message: messages of other libraries may be long."""
     return str(error).strip().partition("\n")[0]

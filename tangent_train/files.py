@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from tangent_train.errors import DataError, SettingError, wrong_field
+from tangent_train.errors import DataError, SettingError, check_choice, wrong_field
 
 
 @contextmanager
@@ -211,6 +211,17 @@ def config_folder() -> Path:
     package = Path(__file__).resolve().parent
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
+
+
+def label_map_file(given: str | Path) -> Path:
+    """Return the file of a label map: a name of this package, or a path, see `load_label_map`."""
+    folder = Path(__file__).with_name("inference") / "label_maps"
+    shipped = sorted(path.stem for path in folder.glob("*.json"))
+    if str(given) in shipped:
+        return folder / f"{given}.json"
+    if Path(given).suffix.lower() != ".json":
+        check_choice("label_map", str(given), (*shipped, "a file my_map.json"))
+    return Path(given)
 
 
 def quoted(path: Path) -> str:

@@ -22,6 +22,9 @@ Align = Literal["none", "scale", "affine", "grid"]
 Upright = Literal["pose", "auto"] | None
 """Source of the up direction of a panorama."""
 
+MOST_ROTATIONS = 360
+"""Largest number of rotations of the views of a panorama to average over."""
+
 DepthKind = Literal[
     "log_distance",
     "metric_distance",

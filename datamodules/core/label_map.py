@@ -16,7 +16,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import DataError, counted
+from tangent_train.errors import DataError, counted, listed
 from tangent_train.files import read_json
 from tangent_train.io.image_files import composed
 from tangent_train.io.pixel_files import read_pixels, read_rgb
@@ -44,7 +44,7 @@ _REFUSED = 255
 _MOST_CLASSES = 254  # labels are uint8, and 0 is unknown
 _MOST_VALUE = 65535
 _COLOR = re.compile(r"#[0-9a-f]{6}")
-_MOST_SHOWN = 8
+
 _EXPECTED = (
     'a list of class names, ["wall", "floor"], or an object with the values, colors or names of '
     'each class, {"wall": 1, "floor": [2, 3]}, {"wall": "#ff0000"} or {"wall": ["painting"]}, '
@@ -143,8 +143,8 @@ class LabelMap:
             others = stored[labels == _REFUSED]
             raise DataError(
                 path,
-                found=f"{_shown(np.unique(others).tolist())} in {counted(len(others), 'pixels')}",
-                expected=_shown(sorted(key for key in self.labels if isinstance(key, int))),
+                found=f"{listed(np.unique(others).tolist())} in {counted(len(others), 'pixels')}",
+                expected=listed(sorted(key for key in self.labels if isinstance(key, int))),
                 remedy="Name the values in the label map, e.g. classes.json.",
             )
         return labels
@@ -160,10 +160,6 @@ class LabelMap:
         if stored.ndim == 3 and not is_colored:
             raise DataError(path, found="colors", expected="values of classes, one per pixel")
         return self.decode(stored, path)
-
-
-def _shown(keys: Sequence[Any]) -> str:
-    return ", ".join(map(str, keys[:_MOST_SHOWN])) + (", …" if len(keys) > _MOST_SHOWN else "")
 
 
 def read_label_map(path: Path) -> LabelMap:
@@ -209,7 +205,7 @@ def read_label_map(path: Path) -> LabelMap:
     names = tuple(composed(str(name)) for name, _ in named)
     kinds = {str if isinstance(key, str) and _COLOR.fullmatch(key) else type(key) for key in labels}
     if wrong or len(kinds) > 1 or not 1 <= len(set(names)) == len(names) <= _MOST_CLASSES:
-        found = _shown(wrong) or f"{len(names)} classes, {len(set(names))} different names"
+        found = listed(wrong) or f"{len(names)} classes, {len(set(names))} different names"
         raise DataError(path, found=found, expected=_EXPECTED)
     if is_list:
         others = [value for value, name in enumerate(content) if name is None]
@@ -271,7 +267,7 @@ def label_doubts(split: str, counts: NDArray[np.int64], class_names: Sequence[st
     missing = [name for name, count in zip(class_names[1:], counts[1:], strict=True) if not count]
     if missing:
         doubts.append(
-            f"Classes without a pixel for {split}: {_shown(missing)} "
+            f"Classes without a pixel for {split}: {listed(missing)} "
             f"({len(missing)} of {len(class_names) - 1})."
         )
     return doubts

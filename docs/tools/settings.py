@@ -75,7 +75,7 @@ def _data_set(data: str) -> str:
     items = []
     for name, of in found.items():
         entry = protocols()[name]
-        every = dict.fromkeys(usual, "–") | of  # depth has no classes
+        every = dict.fromkeys(usual, "") | of  # depth has no classes
         own = _facts({fact: value for fact, value in every.items() if usual.get(fact) != value})
         run = f"Experiment: `{entry['experiment']}`" if "experiment" in entry else ""
         parts = [
@@ -88,7 +88,7 @@ def _data_set(data: str) -> str:
 
 def _facts(values: Mapping[str, str]) -> str:
     shown = {k: v for k, v in values.items() if k != "data" and _USUAL_FACTS.get(k) != v}
-    return "; ".join(f"`{name}` {value}" for name, value in shown.items())
+    return "; ".join(f"`{k}` {v}" if v else f"no `{k}`" for k, v in shown.items())
 
 
 def _commands() -> Iterable[str]:
@@ -228,6 +228,8 @@ def _name(setting: Setting, prefix: str, sections: Collection[str]) -> str:
 
 def _written(setting: Setting) -> str:
     """Return the value of a setting as it is typed; … stands for a required one."""
+    if "required, unless" in setting.comment:
+        return "…"
     if setting.value.startswith("- "):
         return f"[{', '.join(re.findall(r'- (.+)', setting.value))}]"
     return " ".join(setting.value.split()) or "…"

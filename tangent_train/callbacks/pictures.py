@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
@@ -36,7 +37,7 @@ class Pictures(Callback):
     def __init__(self, folder: Path | str, test: int = 6, validation: int = 4) -> None:
         self.folder = Path(folder)
         self.test, self.validation = test, validation
-        self._encoded: dict[int, EncodedImage] = {}
+        self._encoded: dict[int, tuple[float, EncodedImage]] = {}  # with minus the errors
 
     def on_validation_batch_end(  # noqa: D102 - a hook of Lightning
         self,
@@ -62,42 +63,50 @@ class Pictures(Callback):
             except Exception as error:
                 print_text(f"{tag} is not logged: {first_line(error)}", error=True)
 
+    def on_test_batch_start(  # noqa: D102 - a hook of Lightning
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, *_: int
+    ) -> None:
+        chosen = evenly_spread(self.test, len(_dataset(trainer, "test")))
+        task: Any = pl_module
+        task.confidences = [] if np.isin(batch.index.tolist(), chosen).any() else None
+
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
-        for index, *labels in zip(batch.index.tolist(), batch.labels, outputs, strict=True):
-            self.draw(pl_module, _dataset(trainer, "test"), index, *labels)
+        confidences = getattr(pl_module, "confidences", None) or [None] * len(outputs)
+        for result in zip(batch.index.tolist(), confidences, batch.labels, outputs, strict=True):
+            self.draw(pl_module, _dataset(trainer, "test"), *result)
 
-    def draw(self, task: Any, source: Any, index: int, target: Tensor, prediction: Tensor) -> None:
+    def draw(self, task: Any, source: Any, index: int, confidence: Any, *labels: Tensor) -> None:
         """Draw a test image, if it is one of the chosen ones.
 
         Args:
             task: Task with the head and the representation.
             source: Samples of the test split.
             index: Place of the image.
-            target: True labels of the image.
-            prediction: Prediction for the image, one item of the result of `Task.evaluate`.
+            confidence: Its confidences, or None.
+            *labels: Its true labels and its prediction, see `Task.evaluate`.
         """
         name = source.name(index)
         is_chosen = index in evenly_spread(self.test, len(source))
         image = source.read(index) if is_chosen else None
-        panel = None if image is None else _panel(task, image, target, prediction)
+        panel = None if image is None else _panel(task, image, *labels)
         if panel is not None:
             file = f"{index}_{name.replace('/', '_')}.png"  # unique, by the index
             write_pixels(self.folder / file, panel)
-            self._encoded[index] = _encoded(task, name, image, target, prediction)
+            self._encoded[index] = _encoded(task, name, image, confidence, *labels)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the images of all processes."""
         if trainer.world_size > 1:
             parts = [self._encoded] * trainer.world_size
             torch.distributed.all_gather_object(parts, self._encoded)
-            self._encoded = {index: image for part in parts for index, image in part.items()}
+            self._encoded = {index: entry for part in parts for index, entry in part.items()}
 
     @property
     def images(self) -> list[EncodedImage]:
-        """Compressed test images, in the order of the split; after the test of all processes."""
-        return [self._encoded[index] for index in sorted(self._encoded)]
+        """Compressed test images, the worst first; after the test those of all processes."""
+        return [image for _, image in sorted(self._encoded.values())]
 
 
 def _panel(
@@ -116,17 +125,23 @@ def _panel(
         return None
     truth = task.head.truth(target)
     panel: RGB | None = task.head.panel(
-        *shown_arrays(image, truth, prediction, task.representation, most_rows)
+        *shown_arrays(
+            image, truth, prediction, task.representation, most_rows, unknown=task.head.unknown
+        )
     )
     return panel
 
 
-def _encoded(task: Any, name: str, image: Any, target: Tensor, prediction: Tensor) -> EncodedImage:
-    """Return an image with its true and predicted pixels for the report's viewer, see `_panel`."""
+def _encoded(
+    task: Any, name: str, image: Any, confidence: Any, target: Tensor, prediction: Tensor
+) -> tuple[float, EncodedImage]:
+    """Return minus the error of an image, and the image for the report's viewer, see `_panel`."""
     truth, count = task.head.truth(target), len(task.head.class_names)
-    rgb, true, shown = shown_arrays(image, truth, prediction, task.representation, cut=False)
-    how: dict[str, Any] = {"sphere": target.ndim == 2, "note": task.head.note(prediction, truth)}
-    return encode_image(name, rgb, count, prediction=shown, truth=true, **how)
+    given = image, truth, prediction, task.representation
+    rgb, true, shown = shown_arrays(*given, cut=False, unknown=task.head.unknown)
+    error, note = task.head.error(prediction, truth)
+    how: dict[str, Any] = {"sphere": target.ndim == 2, "note": note, "confidence": confidence}
+    return -error, encode_image(name, rgb, count, prediction=shown, truth=true, **how)
 
 
 def _dataset(trainer: Trainer, split: str) -> Any:

@@ -15,7 +15,7 @@ from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
 from tangent_train.cli.scored_files import OF_FILES, score_files
 from tangent_train.config.settings import EvaluateSettings, refuse_typed
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, listed
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
 
@@ -49,8 +49,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     if loaded.class_names != tuple(data.class_names):
         raise SettingError(
             f"data, for {settings.checkpoint}",
-            found=f"class names {list(data.class_names)}",
-            expected=f"{list(loaded.class_names)}, which the network was trained with",
+            found=f"classes {listed(data.class_names)}",
+            expected=f"{listed(loaded.class_names)}, which the network was trained with",
             remedy="Map classes with label_map=.",
         )
     if loaded.inputs:  # images, not shapes

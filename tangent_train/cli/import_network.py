@@ -12,7 +12,7 @@ from rich.text import Text
 from tangent_train.cli import main
 from tangent_train.config.settings import ImportSettings, check_read
 from tangent_train.console import print_text
-from tangent_train.errors import SettingError, printable, width_height
+from tangent_train.errors import SettingError, listed, printable, width_height
 from tangent_train.files import check_new
 from tangent_train.kinds import DepthKind, ScoreKind
 
@@ -110,7 +110,7 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
     return "\n".join(
         [
             f"{path}: {path.stat().st_size / 1e6:.1f} MB",
-            f"{len(names)} classes: {', '.join(names)}" if kind is None else f"depth: {kind}",
+            f"{len(names)} classes: {listed(names)}" if kind is None else f"depth: {kind}",
             *[unknown] * bool(settings.unknown_classes),
             f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
             f"normalization of images from 0 to 1: mean {mean}, std {std}",

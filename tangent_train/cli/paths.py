@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tangent_train.config.help import option_comments
 from tangent_train.config.settings import PredictSettings, RenderSettings, Settings
 from tangent_train.errors import SettingError
-from tangent_train.files import check_new
+from tangent_train.files import check_new, config_folder, label_map_file
 from tangent_train.io.image_files import input_paths
 from tangent_train.manifest import check_continues
 
@@ -15,17 +17,34 @@ _STORED_OTHERWISE = ("checkpoint", "level", "write")
 """Settings of which a manifest holds a digest, or values that replace null."""
 
 
+def _check_root(name: str, section: Mapping[str, Any]) -> None:
+    """Refuse a missing folder of a data set of this package that is not generated."""
+    target, root = str(section.get("_target_")), section.get("root")
+    is_generated = not {"rooms", "shapes"}.isdisjoint(section)
+    if target.startswith("datamodules.") and not is_generated and not Path(str(root)).is_dir():
+        expected = option_comments(config_folder()).get((target, "root"), "folder")
+        raise SettingError(
+            f"{name}.root", found=f"{root}, no such folder", expected=f"a {expected}"
+        )
+
+
 def check_paths(settings: Settings) -> None:
     """Refuse missing inputs, and outputs that exist or were written with other settings.
 
     Raises:
         DataError: There are no images or videos.
-        SettingError: A file is missing, or an output cannot be used.
+        SettingError: A file or folder is missing, or an output cannot be used.
     """
     values: dict[str, Any] = dict(settings)
     start, output = values.get("init_from"), values.get("output")
     if start is not None and values["resume"] is None and not start.exists():
         raise SettingError("init_from", found=start, expected="an existing file")
+    label_map = values.get("label_map")
+    if label_map is not None and not label_map_file(label_map).exists():
+        raise SettingError("label_map", found=label_map, expected="an existing file")
+    photos = dict(values.get("photos") or {})
+    for name, section in (("data", values.get("data")), ("photos.data", photos.get("data"))):
+        _check_root(name, section or {})
     if isinstance(settings, PredictSettings | RenderSettings) and values["input"] is not None:
         input_paths(values["input"])
     for path in filter(None, (output, values.get("figure"))):

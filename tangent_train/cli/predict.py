@@ -17,7 +17,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted
+from tangent_train.errors import DataError, SettingError, counted, listed
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
 from tangent_train.inference import images
@@ -28,9 +28,6 @@ from tangent_train.io.inputs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
-
-_NAMED = 10
-"""Images that a message names, at most."""
 
 _COUNTED_IMAGES = 32
 """Images whose confidences are counted for `min_share`, at most."""
@@ -59,6 +56,7 @@ def predict(settings: PredictSettings) -> None:
     print_text(f"{counted(len(missing) + done, 'images')}, {done} done already.")
     if missing:
         prediction.count(inputs)
+    prediction.shown = {names[k] for k in evenly_spread(settings.report, len(names))}
     errors: dict[str, dict[str, Any]] = {}
     steps = prediction.predict, prediction.read, prediction.write
     with closing(work_on("Predicting", inputs.jobs(missing), len(missing), *steps)) as jobs:
@@ -81,9 +79,9 @@ def predict(settings: PredictSettings) -> None:
             folder.write_page(entries, list(prediction.pictures(inputs, shown)))
         folder.table(entries).print()
         if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
-            named = ", ".join(spoiled[:_NAMED]) + ", …" * (len(spoiled) > _NAMED)
             count = counted(len(spoiled), "images")
-            print_text(f"The network's output is NaN or infinite in parts of {count}: {named}")
+            what = f"The network's output is NaN or infinite in parts of {count}"
+            print_text(f"{what}: {listed(spoiled)}")
         print_text(f"Results are in {settings.output}.")
     if errors:
         total = len(missing) + done
@@ -111,6 +109,7 @@ class _Prediction:
 
     Attributes:
         folder: Output folder.
+        shown: Names of the images in the report, whose confidence is kept for it.
     """
 
     def __init__(self, settings: PredictSettings) -> None:
@@ -129,7 +128,10 @@ class _Prediction:
         }
         check_read(settings, _read(settings, loaded) | of_head)
         head = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
-        self.folder = PredictionFolder(settings.output, head, kinds)
+        title = f"Predictions of {settings.checkpoint.name} ({type(loaded.module).__name__})"
+        self.folder = PredictionFolder(settings.output, head, kinds, title)
+        self.shown: Collection[str] = ()
+        self._confidences: dict[str, Any] = {}
         chosen = settings.levels, settings.base_level, settings.blend, settings.rotations
         views = ViewSelector(loaded, *chosen, settings.views, settings.fill)
         if settings.projection == "equirectangular":
@@ -184,6 +186,10 @@ class _Prediction:
         image, files = self._upright(job.value), self.folder.files(job)
         mosaic = self._predictor.predict(image, progress, averaged="probabilities" in files)
         self._head.write_mosaic(mosaic, image, files)
+        if job.name in self.shown and getattr(mosaic, "has_probabilities", False):
+            seen, step = True if image.valid is None else image.valid, -(-image.shape[0] // 1024)
+            # At most 1024 rows, which saves memory.
+            self._confidences[job.name] = (mosaic.confidences() * seen)[::step, ::step]
 
         def result() -> tuple[Any, Any]:
             return mosaic.pixels(), mosaic.facts
@@ -212,12 +218,17 @@ class _Prediction:
         return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
 
     def pictures(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:
-        """Yield compressed images for the report, if the predicted pixels were written."""
-        for job in inputs.jobs(names):
+        """Yield compressed images for the report, if the predicted pixels were written.
+
+        The least confident are first. Only images that this call has predicted have a confidence.
+        """
+        means = {name: found.mean() for name, found in self._confidences.items()}
+        for job in sorted(inputs.jobs(names), key=lambda job: means.get(job.name, 1)):
             file = self.folder.files(job).get(self._head.source)
             if file is not None:
                 predicted = PredictedImage(self.read(job), self._head.read(file))
-                yield encode_prediction(self._head, job.name, predicted)
+                confidence = self._confidences.get(job.name)
+                yield encode_prediction(self._head, job.name, predicted, confidence)
 
 
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:

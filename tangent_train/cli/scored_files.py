@@ -88,7 +88,7 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
                 for name, of_variant in variants.items() if place in compared else ():
                     turned = _MISTAKES.get(name, torch.clone)(prediction)
                     of_variant.update(head.comparable(turned, head.truth(truth)), head.truth(truth))
-                pictures.draw(task, data.dataset("test"), index, truth, comparable)
+                pictures.draw(task, data.dataset("test"), index, None, truth, comparable)
                 scored.done.append(index)
             yield
 

@@ -69,7 +69,7 @@ def annotate(text: str, command: str) -> str:
         command: Name of the command.
     """
     head, title, printed = re.split(r"^(== Settings.*\n)", text, flags=re.MULTILINE)
-    values, comments = yaml.safe_load(printed), _option_comments(config_folder())
+    values, comments = yaml.safe_load(printed), option_comments(config_folder())
     comments |= {("", s.name): s.comment for s in command_settings(command)}
     headings = _headings(SETTINGS[command])
     groups: dict[str, list[str]] = {h: [] for h in ("required", *headings.values(), "other")}
@@ -165,7 +165,8 @@ def _settings(section: Any, text: str, prefix: str) -> Iterator[Setting]:
             yield Setting(prefix + key.value, written, comment)
 
 
-def _option_comments(folder: Path) -> Comments:
+def option_comments(folder: Path) -> Comments:
+    """Return the comments of the options of all groups."""
     comments: Comments = {}
     files = sorted(folder.glob("*/*.yaml"))
     # The option without a base comes last: its comments replace those of others for its class.

@@ -34,7 +34,7 @@ from pydantic.fields import FieldInfo
 
 from tangent_train.errors import DataError, SettingError, wrong_setting
 from tangent_train.files import config_folder
-from tangent_train.kinds import Align, DepthKind, ScoreKind
+from tangent_train.kinds import MOST_ROTATIONS, Align, DepthKind, ScoreKind
 
 
 def _as_list(value: Any) -> Any:
@@ -143,7 +143,7 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     blend: Blend = "feather"
     """how overlapping views are merged: feather (weighted mean) | nearest (the view with the
     nearest center)"""
-    rotations: PositiveInt = 1
+    rotations: Annotated[int, Field(ge=1, le=MOST_ROTATIONS)] = 1
     """average over this number of rotations about the vertical"""
     upright: Literal["pose", "auto"] | None = None
     """align with gravity by: pose (tags of the file) | auto (the pose if known, else estimated);

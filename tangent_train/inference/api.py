@@ -39,7 +39,15 @@ from datamodules.core.label_map import (
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.config.build import checks_types
-from tangent_train.errors import SettingError, at_least, check_choice, check_type, width_height
+from tangent_train.errors import (
+    SettingError,
+    at_least,
+    check_choice,
+    check_type,
+    listed,
+    width_height,
+)
+from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
@@ -490,13 +498,7 @@ def load_label_map(given: str | Path) -> LabelMap:
         DataError: The file is missing or is not a valid label map.
     """
     check_type("label_map", given, (str, Path), "a name or a path")
-    folder = Path(__file__).with_name("label_maps")
-    shipped = sorted(path.stem for path in folder.glob("*.json"))
-    if str(given) in shipped:
-        return read_label_map(folder / f"{given}.json")
-    if Path(given).suffix.lower() != ".json":
-        check_choice("label_map", str(given), (*shipped, "a file my_map.json"))
-    return read_label_map(Path(given))
+    return read_label_map(label_map_file(given))
 
 
 def map_classes(
@@ -530,8 +532,8 @@ def map_classes(
     if foreign or len(rest) == len(names):
         raise SettingError(
             "label_map",
-            found=f"target classes {', '.join(label_map.names)}",
-            expected=f"a map from {', '.join(names)} to {', '.join(targets)}",
+            found=f"target classes {listed(label_map.names)}",
+            expected=f"a map from {listed(names)} to {listed(targets)}",
         )
     check_choice("unmapped", unmapped, ("unknown", "never"))
     if rest and loaded.score_kind == "labels":
@@ -555,7 +557,7 @@ def map_classes(
         "not in the network": [name for name in target_of if name not in known],
         "unknown where they win" if unmapped == "unknown" else "never win": rest,
     }
-    parts = [f"{target} ← {', '.join(of)}" for target, of in classes.items() if of]
-    parts += [f"{text}: {', '.join(of)}" for text, of in described.items() if of]
+    parts = [f"{target} ← {listed(of)}" for target, of in classes.items() if of]
+    parts += [f"{text}: {listed(of)}" for text, of in described.items() if of]
     changed = replace(loaded, class_names=("unknown", *targets), groups=tuple(given))
     return MappedNetwork(changed, classes, "; ".join(parts))

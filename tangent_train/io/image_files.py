@@ -113,11 +113,17 @@ def image_paths(
 def input_paths(
     pattern: str | Path, tell: Callable[[str], object] = lambda text: None
 ) -> list[Path]:
-    """List the images and videos that a command reads, without opening them, see `image_paths`."""
+    """List the images and videos that a command reads, without opening them, see `image_paths`.
+
+    Folders that a command wrote are skipped, unless `pattern` begins with their name.
+    """
+    begin = Path(pattern)
+    if not begin.is_dir():
+        begin = next(folder for folder in begin.parents if not glob.has_magic(str(folder)))
 
     @cache
     def is_written(folder: Path) -> bool:
-        inside = Path(pattern) in folder.parents
+        inside = begin in folder.parents
         return inside and ((folder / MANIFEST).exists() or is_written(folder.parent))
 
     suffixes = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)

@@ -195,7 +195,7 @@ def error_sums(
         sums[_SEAM + 1] = sums[1] - sums[_SEAM]
         logs = (torch.where(predicted, x, torch.nan).log() for x in (prediction, truth))
         steps = [(log - log.roll(-1, 1)).abs().cpu().numpy() for log in logs]
-        at_seam = seam_sums(*steps, ~np.isnan(steps[1]))
+        at_seam = seam_sums(steps[0], steps[1], ~np.isnan(steps[1]))
         sums[-1, :SEAM_SUMS] = torch.from_numpy(at_seam).to(truth.device)
     return sums
 

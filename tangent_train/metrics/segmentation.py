@@ -161,12 +161,13 @@ def count_image(
         pixels, (steradians, poles, horizon, seam_zone) = bands.sum(dim=0), by_angle
         matrices = poles, horizon, seam_zone, steradians - seam_zone
         maps = [labels.cpu().numpy().astype(np.uint8) for labels in (prediction, truth)]
-        edges = torch.from_numpy(boundary_sums(*maps, k)).to(truth.device)
+        edges = torch.from_numpy(boundary_sums(maps[0], maps[1], k)).to(truth.device)
         of_regions = [torch.stack(_class_sums(matrix)) for matrix in matrices]
         regions = torch.stack([*of_regions, edges])[None]
         known = maps[1] > UNKNOWN
-        steps = (labels != right(labels) for labels in maps)
-        seam = torch.from_numpy(seam_sums(*steps, known & right(known)))[None]
+        changes = [labels != right(labels) for labels in maps]
+        at_seam = seam_sums(changes[0], changes[1], known & right(known))
+        seam = torch.from_numpy(at_seam)[None]
     sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
     counts = pixels, steradians, bands, torch.stack(sums)[None], regions, seam.to(truth.device)
     return SegmentationCounts(*counts)

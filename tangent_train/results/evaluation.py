@@ -282,20 +282,29 @@ def _per_class(result: EvaluationResult) -> Table:
     names = [n for n in result.classes[0] if n != "class" and _is_shown(result, n)]
     columns = {n: result.columns[mean] for n, mean in result.class_means.items()}
     predicted = np.sum(result.confusion, axis=0)[-len(result.classes) :]
+    entries = [
+        entry
+        for entry, count in zip(result.classes, predicted, strict=True)
+        if count or entry[result.main_of_class] is not None
+    ]
     rows = [
         [entry["class"]]
         + [
             str(entry[n]) if n == "images" else score_text(entry[n], getattr(c, "unit", "%"))
             for n, c in zip(names, map(columns.get, names), strict=True)
         ]
-        for entry, count in zip(result.classes, predicted, strict=True)
-        if count or entry[result.main_of_class] is not None
+        for entry in entries
     ]
     titles = (columns[n].class_title if n in columns else _COUNTS[n] for n in names)
     means = (_mean(result, result.class_means[n]) if n in columns else "" for n in names)
     note = f"Means without classes that do not occur in the labels: {', '.join(result.absent)}."
     return Table(
-        "Per class", ["class", *titles], [*rows, ["mean", *means]], note * bool(result.absent)
+        "Per class",
+        ["class", *titles],
+        [*rows, ["mean", *means]],
+        note * bool(result.absent),
+        shares=[entry.get("share", entry.get("images")) or 0 for entry in entries],
+        file=RESULTS_FILE,
     )
 
 
@@ -308,7 +317,7 @@ def confusion_table(result: EvaluationResult) -> Table:
         (name, *(f"{100 * share:.0f}" if share >= 0.005 else "" for share in row))
         for name, row in zip(result.class_names, shares, strict=True)
     ]
-    note = "Rows: truth; columns: prediction; % of the row."
+    note = "Rows: ground truth; columns: prediction; % of the row."
     return Table("Confusion", ("", *result.class_names), rows, note, shades=shares.tolist())
 
 

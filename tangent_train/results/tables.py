@@ -6,17 +6,25 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from textwrap import shorten
 from typing import Any
 
 from rich import table as rich_table
+from rich.cells import cell_len
 from rich.console import Console
 from rich.text import Text
 
 from tangent_train.console import log_text
 from tangent_train.errors import printable
 
-_WIDEST = 10_000
-"""Largest width of a table that is not printed on a terminal, in characters."""
+_WIDTH = 100
+"""Width of a table that is not printed on a terminal, in characters, unless a word needs more."""
+
+_MOST_ROWS = 20
+"""Printed rows of classes."""
+
+_MOST_NOTE = 600
+"""Printed characters of a note."""
 
 _LONG = 32
 """Number of characters above which a cell may take several lines in HTML."""
@@ -35,6 +43,8 @@ class Table:
         shades: Numbers from 0 to 1 for the cells of each row after the first, for a heat map in
             HTML; None for other tables.
         lines: True to print lines between the rows on a terminal.
+        shares: Shares of the first rows, of which only the largest are printed.
+        file: File with all rows.
     """
 
     title: str
@@ -44,6 +54,8 @@ class Table:
     text_columns: Sequence[int] = (0,)
     shades: Sequence[Sequence[float]] | None = None
     lines: bool = False
+    shares: Sequence[float] = ()
+    file: str = ""
 
     def markdown(self) -> str:
         """Return the table as Markdown, below a heading."""
@@ -56,18 +68,27 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def print(self) -> None:
-        """Print the table; on a terminal, it is folded to the terminal's width."""
+        """Print the table, folded to the width of the terminal; of many classes, the largest."""
         log_text(self.markdown())
-        console = Console(highlight=False)
-        if not console.is_terminal:
-            console.width = _WIDEST
-        title, note = (_shown(text) if text else None for text in (self.title, self.note))
+        console, rows = Console(highlight=False), [*self.rows]
+        if (more := len(self.shares) - _MOST_ROWS) > 0:
+            order = sorted(range(len(self.shares)), key=self.shares.__getitem__, reverse=True)
+            rows = [rows[k] for k in order[:_MOST_ROWS]] + rows[len(order) :]
+            rows.insert(_MOST_ROWS, [f"… {more} more in {self.file}", *[""] * len(self.header[1:])])
+        columns = [*zip(self.header, *rows, strict=True)]
+        longest = [0] * len(columns)
+        if not console.is_terminal:  # whole words: a part of a path is useless
+            longest = [max(map(cell_len, " ".join(c).split()), default=0) for c in columns]
+            console.width = max(_WIDTH, sum(longest) + 3 * len(columns) + 1)
+        if sum(max(map(len, column)) + 3 for column in columns) >= console.width:
+            rows = [[cell.replace(" [", "\n[") for cell in row] for row in rows]  # intervals
+        texts = self.title, shorten(self.note, _MOST_NOTE, placeholder=" …")
+        title, note = (_shown(text) if text else None for text in texts)
         table = rich_table.Table(title=title, caption=note, show_lines=self.lines)
-        for k, name in enumerate(self.header):
+        for k, (name, least) in enumerate(zip(self.header, longest, strict=True)):
             justify: Any = "left" if k in self.text_columns else "right"
-            # Folded, not cut: a path is useful only as a whole.
-            table.add_column(_shown(name), justify=justify, overflow="fold")
-        for row in self.rows:
+            table.add_column(_shown(name), justify=justify, overflow="fold", min_width=least)
+        for row in rows:
             table.add_row(*map(_shown, row))
         console.print(table)
 

@@ -158,7 +158,7 @@ def test_an_exported_network_has_the_figures_of_its_run(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"label_map": None}, r"found class names .*'beam'.*; expected .*'dark'.*label_map="),
+        ({"label_map": None}, r"found classes .*beam.*; expected .*dark.*label_map="),
         (
             {"label_map": {"classes": {"floor": ["pink"]}}},
             "a map from dark, green, bright to beam",

@@ -104,6 +104,11 @@ def test_an_interruption_keeps_what_is_done(
     assert predict().keys() == {"a", "b", "c", "d"}
     assert predict(output=tmp_path / "in" / "again").keys() == {"a", "b", "c", "d"}
     assert predict(output=tmp_path / "in" / "more").keys() == {"a", "b", "c", "d"}
+    again = {"input": tmp_path / "in" / "**" / "*.png", "output": tmp_path / "in" / "again"}
+    with pytest.raises(SystemExit, match=r"input: found .*; expected in, with which .*again"):
+        predict(**again)
+    again["output"] = tmp_path / "in" / "of_pattern"
+    assert len(predict(**again)) == len(predict(**again)) == 4
 
 
 def test_a_part_of_a_panorama_is_labeled_as_that_part(

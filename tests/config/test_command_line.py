@@ -55,6 +55,12 @@ def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
         ("train fast", "fast: found a word without =; .*tangent-train --help lists them."),
         ("train experiment=rooms/demoo", "experiment: found rooms/demoo; .*mean rooms/demo?"),
         ("train recipe=small recipe/task=small_mine", "recipe/task: found small_mine; "),
+        (
+            "check data=folder data.root=no",
+            "found no, no such folder; expected a folder with classes",
+        ),
+        ("transfer experiment=rooms/transfer label_map=no.json", "label_map: found no.json; "),
+        ("predict input=. output=a checkpoint=. rotations=361", "less than or equal to 360."),
         ("train data=5", "data: found 5; expected one of cityscapes, densepass, "),
         (
             "train debug=true",

@@ -193,6 +193,9 @@ def test_settings_of_one_name_are_explained_apart() -> None:
         ("train", "resume=nowhere", "nowhere: found no config.yaml"),
         ("export", "output=x.onnx", "tangent-export: Missing: checkpoint=. Example: "),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
+        ("train", "", "Missing: data= or experiment="),
+        ("check", "data=folder data.root=no", "data.root: found no, no such folder"),
+        ("evaluate", "checkpoint=. data=synthrooms label_map=no.json", "label_map: found no.json"),
     ],
 )
 def test_answers_before_anything_heavy_is_imported(
@@ -200,7 +203,7 @@ def test_answers_before_anything_heavy_is_imported(
 ) -> None:
     code = (
         f"import sys; from tangent_train.cli.main import {command}\n"
-        f"sys.argv = ['tangent-{command}', '{argument}']\n"
+        f"sys.argv = ['tangent-{command}', *'{argument}'.split()]\n"
         f"try:\n    {command}()\n"
         "finally:\n    heavy = {'torch', 'lightning', 'cv2', 'numba'} & set(sys.modules)\n"
         "    print('heavy', len(heavy))"

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from html import unescape
 
 import markdown  # type: ignore[import-untyped]
 import pytest
 
+from tangent_train.results.evaluation import result_tables
 from tangent_train.results.tables import Table
+from tests.results.example_results import example_result
 
 
 @pytest.mark.parametrize(
@@ -35,3 +38,44 @@ def test_markdown_shows_names_as_text(name: str) -> None:
     assert tags <= {"h2", "table", "thead", "tbody", "tr", "th", "td", "p"}
     shown = " ".join(name.split("\n"))
     assert unescape(re.sub(r"<[^<>]*>", "\n", page)).split("\n").count(shown) == 4
+
+
+def _per_class(count: int) -> Table:
+    """Table of classes with intervals; class k has the share k * 7 % count."""
+    names = [f"class_with_a_long_name_{k}" for k in range(count)]
+    result = example_result([0.5] * count, names, bands=[0.5])
+    classes = [{**one, "share": 7 * k % count / count} for k, one in enumerate(result.classes)]
+    intervals = dict.fromkeys(result.scores, (0.456, 0.545))
+    counts = [[1] * (count + 1)] * (count + 1)
+    changes = {"classes": classes, "intervals": intervals, "confusion": counts}
+    return result_tables(replace(result, **changes))[0]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("count", [13, 20, 21, 150])
+def test_printed_classes_fit_100_columns_the_largest_first(
+    count: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = _per_class(count)
+    table.print()
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 100
+    text = "".join(lines)
+    shown = [int(k) for k in re.findall(r"long_name_(\d+)", text)]
+    if count <= 20:
+        assert shown == [*range(count)]
+        assert "more in" not in text
+    else:
+        assert shown == sorted(range(count), key=lambda k: -(7 * k % count))[:20]
+        assert f"… {count - 20} more in results.json" in text
+    assert "[45.6, 54.5]" in text  # of the mean
+    assert table.markdown().count("long_name_") == count
+
+
+def test_long_notes_are_printed_in_part(capsys: pytest.CaptureFixture[str]) -> None:
+    note = ", ".join(f"class {k}" for k in range(150))
+    table = Table("", ("name", "score"), [("a", "1")], note)
+    table.print()
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "class 9, " in printed
+    assert "class 149" not in printed
+    assert note in table.markdown()

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tangent_train.errors import SettingError, at_least, check_choice
 from tangent_train.geometry import MOST_ROWS, panorama_rows, random_rotation
+from tangent_train.kinds import MOST_ROTATIONS
 from tangent_train.rendering.forward import Blend, rotate_equirect
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
@@ -123,7 +124,7 @@ class EquirectRepresentation:
             at_least("representation.rows", rows, 1, MOST_ROWS)
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
-        at_least("representation.rotations", rotations, 1)
+        at_least("representation.rotations", rotations, 1, MOST_ROTATIONS)
         self.erp_height = panorama_rows(level, erp_height)
         self.crop_deg = crop_deg
         self.random_rotation = random_rotation

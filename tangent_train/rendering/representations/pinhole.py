@@ -24,6 +24,7 @@ from tangent_train.geometry import (
 from tangent_train.geometry.camera import half_width
 from tangent_train.geometry.coverage import best_views, check_coverage, needed_views
 from tangent_train.geometry.sphere import area_mask, check_area
+from tangent_train.kinds import MOST_ROTATIONS
 from tangent_train.rendering.forward import Blend, blend_of
 from tangent_train.rendering.representations.views import STRIDE, PinholeViews, RotationAugmentation
 
@@ -383,7 +384,7 @@ def vertical_rotations(count: int, period_deg: float = 360.0) -> list[NDArray[np
     Raises:
         SettingError: The count is less than 1.
     """
-    step = math.radians(period_deg / at_least("rotations", count, 1))
+    step = math.radians(period_deg / at_least("rotations", count, 1, MOST_ROTATIONS))
     return [rotation_about((0, 0, 1), step * k) for k in range(count)]
 
 

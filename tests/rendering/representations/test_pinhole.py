@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,14 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
     assert {images.shape[1:] for images in rendered} == {representation.image_size}
     back = _labels_of(source, [_scores(images) for images in rendered])
     assert np.mean(back == labels) > 0.95, "all but the borders between classes"
+
+
+@pytest.mark.parametrize("build", [partial(TangentRepresentation, 0), EquirectRepresentation])
+def test_rotations_have_a_limit(build: Any) -> None:
+    for count in (0, 361, 10**9):
+        with pytest.raises(SettingError, match=f"rotations: found {count}; .* from 1 to 360"):
+            build(5, rotations=count)
+    assert len(build(5, rotations=3).view_sets()) == 3
 
 
 @pytest.mark.parametrize(
