@@ -191,11 +191,12 @@ class Run:
             folds=data.folds,
             settings=evaluation.flat_settings(self.settings.model_dump(mode="json")),
         )
-        notes, tables = [f"Checkpoint: {name}", *self.notes], evaluation.result_tables(result)
+        source = "Checkpoint" if task.network is not None else "Predictions"
+        notes, tables = [f"{source}: {name}", *self.notes], evaluation.result_tables(result)
         summary, (rows, sources) = evaluation.summary_lines(result), published_rows([result])
         published = [published_table(rows, result)] if rows else []
         evaluation.write_results(result, self.folder, [*notes, *sources], published)
-        network = type(self.as_loaded().module).__name__
+        network = source if task.network is None else type(self.as_loaded().module).__name__
         images = [i for c in callbacks if isinstance(c, Pictures) for i in c.images]
         shown = [f"Shown: {len(images)} of {result.images} {data.noun}, the worst first."]
         write_report(

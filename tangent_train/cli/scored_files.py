@@ -72,7 +72,7 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     scored = ScoredFiles(settings, data, head)
     metric = head.build_metric()
     pictures = Pictures(folder / "panels", settings.panels)
-    task = SimpleNamespace(head=head, representation=data.representation)
+    task = SimpleNamespace(network=None, head=head, representation=data.representation)
     groups: dict[str, list[int]] = defaultdict(list)
     variants = {name: head.build_metric() for name in ("as they are", *_MISTAKES)}
     compared = evenly_spread(_COMPARED, len(scored.indices))
