@@ -135,7 +135,7 @@ def count_image(
     """
     k = num_classes
     pairs = torch.add(_checked(prediction, k), _checked(truth, k), alpha=k)
-    bands = pairs.new_zeros((len(BAND_EDGES_DEG) - 1, k, k))
+    bands = torch.zeros((len(BAND_EDGES_DEG) - 1, k, k), dtype=torch.int64, device=truth.device)
     if truth.ndim != 2:
         pixels = _counted(pairs[None], k)[0]
         steradians = torch.zeros_like(pixels, dtype=torch.float64)
@@ -175,7 +175,7 @@ def count_image(
 
 def _counted(pairs: Tensor, num_classes: int) -> Tensor:
     """Count pairs ``(n, …)`` in n matrices; those of unknown pixels are left out."""
-    k, rows = num_classes, torch.arange(len(pairs), device=pairs.device)
+    k, rows = num_classes, torch.arange(len(pairs), device=pairs.device, dtype=torch.int32)
     flat = (pairs.flatten(1) + (rows * k * k)[:, None]).flatten()
     counts = torch.bincount(flat, minlength=len(pairs) * k * k).reshape(-1, k, k)
     counts[:, UNKNOWN] = 0
@@ -183,7 +183,7 @@ def _counted(pairs: Tensor, num_classes: int) -> Tensor:
 
 
 def _checked(indices: Tensor, num_classes: int) -> Tensor:
-    indices = indices.long()
+    indices = indices.int()
     least, greatest = map(int, indices.aminmax()) if indices.numel() else (0, 0)
     if least < 0 or greatest >= num_classes:
         raise SettingError(
