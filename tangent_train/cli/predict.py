@@ -24,7 +24,7 @@ from tangent_train.inference import images
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.engine import Predictor, UpLikelihood
 from tangent_train.inference.views import ViewSelector
-from tangent_train.io.inputs import Inputs, Job, work_on
+from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tangent_train.heads.base import Head, PredictedImage
-    from tangent_train.io.inputs import Job, Video
+    from tangent_train.io.jobs import Job, Video
 
 Entry = dict[str, Any]
 """Entry of an image: name, file, rows, columns and its summary, or name and error."""
