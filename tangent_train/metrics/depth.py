@@ -242,7 +242,7 @@ def sphere_scores(sums: Float[np.ndarray, "images regions sums"]) -> dict[str, N
         sums: Sums of each image with the weightings `SPHERE`.
 
     Returns:
-        Scores by name; NaN where an image has none.
+        Scores by name; NaN where they are undefined.
     """
     poles, horizon, seam, elsewhere = depth_scores(sums[:, :-1])["absrel"].T
     steps = seam_step(sums[:, -1, :SEAM_SUMS])
