@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from tangent_train.errors import of_extra
 from tangent_train.geometry import equirect_shape
 
-_Value = bool | int | float | str | None
 _GRID = "legendre-gauss"
 
 
@@ -46,7 +45,7 @@ class HarmonicNetwork(nn.Module):
         in_channels: int,
         num_classes: int,
         level: int,
-        options: Mapping[str, _Value | Sequence[_Value]],
+        options: Mapping[str, Any],
     ) -> None:
         super().__init__()
         with of_extra("spectral", f"network={architecture}"):

@@ -15,11 +15,6 @@ from torch.nn import functional
 from models.unet import check_size
 from tangent_train.errors import SettingError, of_extra
 
-_Value = bool | int | float | str | None
-_Values = _Value | Sequence[_Value | Sequence[_Value | Sequence[_Value]]]
-_Section = Mapping[str, _Values | Mapping[str, _Values]]
-_Config = Mapping[str, _Values | _Section | Sequence[Mapping[str, _Values]]]
-
 SEGMENTATION = "SEMANTIC_SEGMENTATION", "UNIVERSAL_SEGMENTATION"
 """Tasks of networks that return classes, in the names of transformers' mappings."""
 
@@ -157,7 +152,7 @@ class HuggingFaceNetwork(_TransformersNetwork):
 
     def __init__(
         self,
-        config: _Config,
+        config: Mapping[str, Any],
         num_classes: int,
         bgr: bool = False,
         task: Sequence[int] | None = None,
@@ -218,7 +213,7 @@ class HuggingFaceDepthNetwork(_TransformersNetwork):
         SettingError: transformers lacks the network or is missing.
     """
 
-    def __init__(self, config: _Config, bgr: bool = False, padded: bool = False) -> None:
+    def __init__(self, config: Mapping[str, Any], bgr: bool = False, padded: bool = False) -> None:
         super().__init__(config, (DEPTH,), bgr)
         self._padded = padded
         self._resizing = "bilinear" if config["model_type"] in _BILINEAR else "bicubic"

@@ -12,8 +12,8 @@ import math
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from datamodules.core.files import Problems
@@ -102,7 +102,8 @@ class HomePanorama(NamedTuple):
         """
         seen, floor_z = self.record.layout_visible, -self.record.camera_height
         vertices = np.array(seen.vertices if seen else [], np.float64).reshape(-1, 2)
-        if seen is None or not _surrounds_origin(vertices):
+        polygon = vertices.astype(np.float32)
+        if seen is None or cv2.pointPolygonTest(polygon, (0, 0), measureDist=False) <= 0:
             raise DataError(self.file, found=f"{seen}", expected=f"a room around {self.name}")
         kinds = ((seen.openings, OPENING), (seen.doors, DOOR), (seen.windows, WINDOW))
         fixtures = [
@@ -143,11 +144,3 @@ def list_home_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
                 for name, record in panoramas.items()
             ]
     return found
-
-
-def _surrounds_origin(vertices: NDArray[np.float64]) -> bool:
-    """True if a polygon goes round the origin once."""
-    angles = np.arctan2(vertices[:, 1], vertices[:, 0])
-    steps = np.diff(angles, append=angles[:1])
-    angles = (steps + np.pi) % (2 * np.pi) - np.pi
-    return bool(abs(abs(angles.sum()) - 2 * np.pi) < np.pi / 2)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 import warnings
 from collections.abc import Callable, Mapping
@@ -23,9 +22,6 @@ from tangent_train.files import load_plain, write_text
 
 _IDENTITIES = {CSVLogger: "version", MLFlowLogger: "run_id", WandbLogger: "id"}
 """Arguments that continue a run; its `version` is their value."""
-
-_AT_START = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "2", "MLFLOW_HTTP_REQUEST_TIMEOUT": "15"}
-"""Environment variables, unless set, while loggers connect: MLflow's own wait for minutes."""
 
 
 def start_loggers(
@@ -56,8 +52,6 @@ def start_loggers(
         reached = load_plain(resumed, "a checkpoint of a run", mmap=True)
     for name, section in (sections or {}).items():
         step = reached["global_step"] if name in stored else None
-        added = {variable: _AT_START[variable] for variable in _AT_START.keys() - os.environ.keys()}
-        os.environ.update(added)
         try:
             loggers[name] = _build(name, section, folder, stored.get(name, {}), step)
             if step is None:
@@ -73,9 +67,6 @@ def start_loggers(
             remedy = f"To log elsewhere: ~{place}"
             expected = f"that {type(error).__module__.split('.')[0]} can start it"
             raise SettingError(place, found=found, expected=expected, remedy=remedy) from error
-        finally:
-            for variable in added:
-                del os.environ[variable]
     if loggers:
         _store(file, stored, loggers)
     for name, logger in loggers.items():

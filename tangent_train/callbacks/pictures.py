@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
@@ -33,15 +34,15 @@ class Pictures(Callback):
         validation: Number of validation images, of the first process.
 
     Attributes:
-        images: Compressed test images for the report; after the test those of all processes, in the
-            order of the split.
+        images: Compressed test images for the report; after the test those of all processes, the
+            worst first.
     """
 
     def __init__(self, folder: Path | str, test: int = 6, validation: int = 4) -> None:
         self.folder = Path(folder)
         self.test, self.validation = test, validation
         self.images: list[EncodedImage] = []
-        self._encoded: dict[int, EncodedImage] = {}
+        self._encoded: dict[int, tuple[float, EncodedImage]] = {}  # with minus the errors
 
     def on_validation_batch_end(  # noqa: D102 - a hook of Lightning
         self,
@@ -67,27 +68,36 @@ class Pictures(Callback):
             except Exception as error:
                 print_text(f"{tag} is not logged: {first_line(error)}", error=True)
 
+    def on_test_batch_start(  # noqa: D102 - a hook of Lightning
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, *_: int
+    ) -> None:
+        chosen = evenly_spread(self.test, len(_dataset(trainer, "test")))
+        task: Any = pl_module
+        task.confidences = [] if np.isin(batch.index.tolist(), chosen).any() else None
+
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         source = _dataset(trainer, "test")
         chosen = evenly_spread(self.test, len(source))
-        for index, *labels in zip(batch.index.tolist(), batch.labels, outputs, strict=True):
+        confidences = getattr(pl_module, "confidences", None) or [None] * len(outputs)
+        results = zip(batch.index.tolist(), confidences, batch.labels, outputs, strict=True)
+        for index, confidence, *labels in results:
             name = source.name(index)
             image = source.read(index) if index in chosen else None
             panel = None if image is None else _panel(pl_module, image, *labels)
             if panel is not None:
                 file = f"{index}_{name.replace('/', '_')}.png"  # unique, by the index
                 write_pixels(self.folder / file, panel)
-                self._encoded[index] = _encoded(pl_module, name, image, *labels)
+                self._encoded[index] = _encoded(pl_module, name, image, confidence, *labels)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the images of all processes."""
         parts = [self._encoded] * trainer.world_size
         if trainer.world_size > 1:
             torch.distributed.all_gather_object(parts, self._encoded)
-        gathered = {index: image for part in parts for index, image in part.items()}
-        self.images = [gathered[index] for index in sorted(gathered)]
+        gathered = {index: entry for part in parts for index, entry in part.items()}
+        self.images = [image for _, image in sorted(gathered.values())]
 
 
 def _panel(
@@ -106,17 +116,23 @@ def _panel(
         return None
     truth = task.head.truth(target)
     panel: RGB | None = task.head.panel(
-        *shown_arrays(image, truth, prediction, task.representation, most_rows)
+        *shown_arrays(
+            image, truth, prediction, task.representation, most_rows, unknown=task.head.unknown
+        )
     )
     return panel
 
 
-def _encoded(task: Any, name: str, image: Any, target: Tensor, prediction: Tensor) -> EncodedImage:
-    """Return an image with its true and predicted pixels for the report's viewer, see `_panel`."""
+def _encoded(
+    task: Any, name: str, image: Any, confidence: Any, target: Tensor, prediction: Tensor
+) -> tuple[float, EncodedImage]:
+    """Return minus the error of an image, and the image for the report's viewer, see `_panel`."""
     truth, count = task.head.truth(target), len(task.head.class_names)
-    rgb, true, shown = shown_arrays(image, truth, prediction, task.representation, cut=False)
-    how: dict[str, Any] = {"sphere": target.ndim == 2, "note": task.head.note(prediction, truth)}
-    return encode_image(name, rgb, count, prediction=shown, truth=true, **how)
+    given = image, truth, prediction, task.representation
+    rgb, true, shown = shown_arrays(*given, cut=False, unknown=task.head.unknown)
+    error, note = task.head.error(prediction, truth)
+    how: dict[str, Any] = {"sphere": target.ndim == 2, "note": note, "confidence": confidence}
+    return -error, encode_image(name, rgb, count, prediction=shown, truth=true, **how)
 
 
 def _dataset(trainer: Trainer, split: str) -> Any:

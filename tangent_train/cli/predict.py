@@ -24,7 +24,7 @@ from tangent_train.inference import images
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.engine import Predictor, UpLikelihood
 from tangent_train.inference.views import ViewSelector
-from tangent_train.io.inputs import Inputs, Job, work_on
+from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
@@ -56,6 +56,7 @@ def predict(settings: PredictSettings) -> None:
     print_text(f"{counted(len(missing) + done, 'images')}, {done} done already.")
     if missing:
         prediction.count(inputs)
+    prediction.shown = {names[k] for k in evenly_spread(settings.report, len(names))}
     errors: dict[str, dict[str, Any]] = {}
     steps = prediction.predict, prediction.read, prediction.write
     with closing(work_on("Predicting", inputs.jobs(missing), len(missing), *steps)) as jobs:
@@ -108,6 +109,7 @@ class _Prediction:
 
     Attributes:
         folder: Output folder.
+        shown: Names of the images in the report, whose confidence is kept for it.
     """
 
     def __init__(self, settings: PredictSettings) -> None:
@@ -126,7 +128,10 @@ class _Prediction:
         }
         check_read(settings, _read(settings, loaded) | of_head)
         head = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
-        self.folder = PredictionFolder(settings.output, head, kinds)
+        title = f"Predictions of {settings.checkpoint.name} ({type(loaded.module).__name__})"
+        self.folder = PredictionFolder(settings.output, head, kinds, title)
+        self.shown: Collection[str] = ()
+        self._confidences: dict[str, Any] = {}
         chosen = settings.levels, settings.base_level, settings.blend, settings.rotations
         views = ViewSelector(loaded, *chosen, settings.views, settings.fill)
         if settings.projection == "equirectangular":
@@ -181,6 +186,10 @@ class _Prediction:
         image, files = self._upright(job.value), self.folder.files(job)
         mosaic = self._predictor.predict(image, progress, averaged="probabilities" in files)
         self._head.write_mosaic(mosaic, image, files)
+        if job.name in self.shown and getattr(mosaic, "has_probabilities", False):
+            seen, step = True if image.valid is None else image.valid, -(-image.shape[0] // 1024)
+            # At most 1024 rows, which saves memory.
+            self._confidences[job.name] = (mosaic.confidences() * seen)[::step, ::step]
 
         def result() -> tuple[Any, Any]:
             return mosaic.pixels(), mosaic.facts
@@ -209,12 +218,17 @@ class _Prediction:
         return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
 
     def pictures(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:
-        """Yield compressed images for the report, if the predicted pixels were written."""
-        for job in inputs.jobs(names):
+        """Yield compressed images for the report, if the predicted pixels were written.
+
+        The least confident are first. Only images that this call has predicted have a confidence.
+        """
+        means = {name: found.mean() for name, found in self._confidences.items()}
+        for job in sorted(inputs.jobs(names), key=lambda job: means.get(job.name, 1)):
             file = self.folder.files(job).get(self._head.source)
             if file is not None:
                 predicted = PredictedImage(self.read(job), self._head.read(file))
-                yield encode_prediction(self._head, job.name, predicted)
+                confidence = self._confidences.get(job.name)
+                yield encode_prediction(self._head, job.name, predicted, confidence)
 
 
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:

@@ -37,7 +37,7 @@ from tangent_train.io.camera_files import (
     write_rig,
 )
 from tangent_train.io.gpano import eye_part, read_area, read_tags, shape_of
-from tangent_train.io.inputs import Inputs, Job, work_on
+from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_image_size, write_pixels
 from tangent_train.io.tangent_folders import (

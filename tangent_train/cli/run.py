@@ -193,13 +193,16 @@ class Run:
         summary, (rows, sources) = evaluation.summary_lines(result), published_rows([result])
         published = [published_table(rows, result)] if rows else []
         evaluation.write_results(result, self.folder, [*notes, *sources], published)
+        network = type(self.as_loaded().module).__name__
+        images = [i for c in callbacks if isinstance(c, Pictures) for i in c.images]
+        shown = [f"Shown: {len(images)} of {result.images} {data.noun}, the worst first."]
         write_report(
             self.folder / "report.html",
-            f"Evaluation of {checkpoint.name}",
+            f"{network} on {type(data).__name__} ({checkpoint.name})",
             tables=[*tables, *([evaluation.confusion_table(result)] if result.confusion else [])],
-            images=[i for c in callbacks if isinstance(c, Pictures) for i in c.images],
+            images=images,
             class_names=head.class_names,
-            notes=[*summary, *notes],
+            notes=[*summary, *notes, *shown * bool(images)],
         )
         print_text("\n".join([*self.notes, *summary]))
         tables[0].print()

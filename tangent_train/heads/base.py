@@ -252,9 +252,9 @@ class Head(nn.Module, ABC):
         """Draw one prediction beside the truth; None if the head draws no pictures."""
         return None
 
-    def note(self, prediction: Tensor, truth: Tensor) -> str:
-        """Return the score of one image as text for the report's viewer."""
-        return ""
+    def error(self, prediction: Tensor, truth: Tensor) -> tuple[float, str]:
+        """Return an error of one image, to sort images, and its score as text for the report."""
+        return 0.0, ""
 
     def file_kinds(self, write: Sequence[str] | None) -> Sequence[str]:
         """Return the kinds of output of the setting `write`.

@@ -217,13 +217,14 @@ class ClassesHead(Head):
         """Draw input, ground truth, prediction and error in a 2 × 2 grid above a legend."""
         return pictures.prediction_panel(rgb, truth, prediction, self.class_names)
 
-    def note(self, prediction: Tensor, truth: Tensor) -> str:
-        """Return the mIoU of one image; "" without labeled pixels."""
+    def error(self, prediction: Tensor, truth: Tensor) -> tuple[float, str]:
+        """Return 1 − mIoU of one image, and the mIoU; 0 and "" without labeled pixels."""
         if not truth.any():
-            return ""
+            return 0.0, ""
         count = len(self.class_names)
         counts = segmentation.count_image(prediction.cpu(), truth.cpu(), count).pixels
-        return f"mIoU {100 * segmentation.segmentation_scores(counts).means['miou']:.1f}\u00a0%"
+        miou = float(segmentation.segmentation_scores(counts).means["miou"])
+        return 1 - miou, f"mIoU {100 * miou:.1f}\u00a0%"
 
     def count(self, mosaics: Iterable[LabelMosaic]) -> str:
         """Find the confidence that pixels of each class need for `min_share`.

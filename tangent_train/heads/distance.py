@@ -264,11 +264,11 @@ class DistanceHead(Head):
         """Draw input, true and predicted distance, and error in a 2 × 2 grid."""
         return pictures.distance_panel(rgb, truth, prediction)
 
-    def note(self, prediction: Tensor, truth: Tensor) -> str:
-        """Return AbsRel of one image; "" without known distances."""
+    def error(self, prediction: Tensor, truth: Tensor) -> tuple[float, str]:
+        """Return AbsRel of one image, also as text; 0 and "" without known distances."""
         sums = metrics.error_sums(prediction, truth)[:1].cpu().numpy()
         absrel = metrics.mean_depth_scores(sums)["absrel"]
-        return "" if np.isnan(absrel) else f"AbsRel {absrel:.3g}"
+        return (0.0, "") if np.isnan(absrel) else (float(absrel), f"AbsRel {absrel:.3g}")
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write depth, a colored picture and points."""

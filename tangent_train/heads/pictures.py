@@ -54,7 +54,7 @@ def colorize_distance(
     is_known = np.isfinite(distance) & (distance > 0)
     place = np.log(np.where(is_known, distance, near) / near) / np.log(far / near)
     colors = distance_colors()[np.rint(255 * place.clip(0, 1)).astype(np.uint8)]
-    return np.where(is_known[..., None], colors, np.uint8(UNKNOWN_COLOR))
+    return np.where(is_known[..., None], colors, UNKNOWN_COLOR)
 
 
 def mixed_picture(rgb: _Image, labels: NDArray[np.integer], class_names: tuple[str, ...]) -> _Image:
@@ -202,15 +202,9 @@ def _grid(tiles: Mapping[str, _Image]) -> _Image:
     return np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
 
 
-def _write(
-    image: _Image,
-    text: str,
-    origin: tuple[int, int],
-    scale: int,
-    color: tuple[int, int, int] = (0, 0, 0),
-) -> None:
+def _write(image: _Image, text: str, at: tuple[int, int], scale: int, color: Any = 0) -> None:
     font = cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(image, text, origin, font, 0.45 * scale, color, scale, cv2.LINE_AA)
+    cv2.putText(image, text, at, font, 0.45 * scale, color, scale, cv2.LINE_AA)
 
 
 def shown_arrays(
@@ -221,6 +215,7 @@ def shown_arrays(
     most_rows: int | None = None,
     *,
     cut: bool = True,
+    unknown: float = UNKNOWN,
 ) -> tuple[_Image, NDArray[Any], NDArray[Any]]:
     """Return a panorama with its labels, or the crops of a photo side by side.
 
@@ -232,23 +227,21 @@ def shown_arrays(
         most_rows: Largest number of rows, to which larger images are downsampled; None for all.
         cut: True to cut a partial panorama to the box around its valid pixels. Elsewhere, it is
             gray and unknown.
+        unknown: Value of unknown pixels, see `Head`.
 
     Returns:
         RGB ``(H, W, 3)``, true and predicted labels ``(H, W)``; for crops, W is n·w. Where there is
         no picture, i.e. black without a label, RGB is gray, and both labels are unknown.
     """
-    shown = image.rgb, target.cpu().numpy(), prediction.cpu().numpy()
+    rgb, truth, labels = image.rgb, target.cpu().numpy(), prediction.cpu().numpy()
     if target.ndim == 3:
         (crops,) = image.sampler(representation).view_sets()
-        rgb, truth, labels = map(np.hstack, (crops.render(image.rgb, "bilinear"), *shown[1:]))
-    else:
-        rgb, truth, labels = shown
+        rgb, truth, labels = map(np.hstack, (crops.render(rgb, "bilinear"), truth, labels))
     valid = image.valid if target.ndim == 2 else None
     is_seen = rgb.any(axis=-1) | (truth > 0)
     is_seen &= True if valid is None else valid
-    unknown = truth.dtype.type(np.nan if truth.dtype.kind == "f" else UNKNOWN)
-    rgb = np.where(is_seen[..., None], rgb, np.uint8(UNKNOWN_COLOR))
-    truth, labels = (np.where(is_seen, array, unknown) for array in (truth, labels))
+    rgb = np.where(is_seen[..., None], rgb, UNKNOWN_COLOR)
+    truth, labels = (np.where(is_seen, m, m.dtype.type(unknown)) for m in (truth, labels))
     if cut and valid is not None:
         box = _box(valid)
         rgb, truth, labels = (array[box] for array in (rgb, truth, labels))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-UNKNOWN_COLOR = (136, 136, 136)
+UNKNOWN_COLOR = np.full(3, 136, np.uint8)
 """Gray of unknown pixels: no label, no distance, or no picture."""
 
 _LIGHTNESS = (30, 92)  # L* of generated colors
@@ -52,6 +52,13 @@ Of the ten most frequent classes of a data set, no two are nearer than 15 in CIE
 vision and without red or green cones.
 """
 
+_COLORS = {
+    word.rstrip("s"): (int(color, 16), rank)
+    for color, line in _MEANINGS.items()
+    for rank, word in enumerate(line.split())
+}
+"""Color of each word, and its rank among those of the same meaning."""
+
 _SEEN = np.array(
     [
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -77,16 +84,14 @@ def class_colors(class_names: tuple[str, ...]) -> NDArray[np.uint8]:
     Returns:
         ``(K+1, 3)`` RGB, not writable.
     """
-    values = np.arange(0, 256, 17)  # the place of a color is the number #rgb
-    rgb = np.stack(np.meshgrid(values, values, values, indexing="ij"), axis=-1).reshape(-1, 3)
+    rgb = 17 * np.indices((16, 16, 16)).reshape(3, -1).T  # the place of a color is the number #rgb
     lab = colors_as_seen(rgb)
     light, hue = lab[:, 0, 0], np.arctan2(lab[:, 0, 2], lab[:, 0, 1])
     away = np.where((light >= _LIGHTNESS[0]) & (light <= _LIGHTNESS[1]), np.inf, 0.0)
     meanings = [(0x888, 0), *map(_meaning, class_names[1:])][: len(class_names)]
-    best: dict[int, tuple[int, int]] = {}  # of each meaning
-    for label, (meaning, rank) in enumerate(meanings):
-        best[meaning] = min(best.get(meaning, (rank, label)), (rank, label))
-    is_best = [m >= 0 and best[m][1] == label for label, (m, _) in enumerate(meanings)]
+    by_rank = sorted(range(len(meanings)), key=lambda label: meanings[label][1])
+    best = {meanings[label][0]: label for label in reversed(by_rank)}
+    is_best = [k >= 0 and best[k] == label for label, (k, _) in enumerate(meanings)]
     chosen = {}
     for label in sorted(range(len(meanings)), key=lambda label: not is_best[label]):
         place = meanings[label][0]
@@ -106,14 +111,9 @@ def _meaning(name: str) -> tuple[int, int]:
 
     Of several names, e.g. "sofa, couch", the first with a known word counts.
     """
-    of_words = {
-        word.rstrip("s"): (int(color, 16), rank)
-        for color, line in _MEANINGS.items()
-        for rank, word in enumerate(line.split())
-    }
     for synonym in re.split("[,;/]", name.lower()):
         words = [word.rstrip("s") for word in re.findall("[a-z]+", synonym)]
-        if known := [of_words[word] for word in words if word in of_words]:
+        if known := [_COLORS[word] for word in words if word in _COLORS]:
             return known[-1][0], known[-1][1] + len(words) - 1
     return -1, 0
 

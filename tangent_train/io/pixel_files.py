@@ -128,17 +128,21 @@ def _open_stored(path: Path, file: IO[bytes], channel: str | None) -> _StoredIma
     if page is not None:
         found = page.tags.valueof(Tag.Orientation)
         orientation = found if found in range(1, 9) else 1
-        decode = partial(_decode_deep_tiff, file, page)
-        profile = page.tags.valueof(Tag.InterColorProfile)
-        return _StoredImage((page.imagelength, page.imagewidth), decode, orientation, profile)
+        profile, size = (
+            page.tags.valueof(Tag.InterColorProfile),
+            (page.imagelength, page.imagewidth),
+        )
+        return _StoredImage(size, lambda _: _decode_deep_tiff(file, page), orientation, profile)
     file.seek(0)
     image = Image.open(file, formats=IMAGE_FORMATS)
-    decode, profile = partial(_decode, image, file), None
+    size, orientation = (image.height, image.width), _orientation(image)
     layout = str(image.tile[0][3]) if image.format == "PNG" else ""
     if layout.endswith("16B"):  # Pillow would cut colors to 8 bits
-        decode = partial(_decode_deep_png, file, image, layout.startswith("LA"))
         profile = image.info.get("icc_profile")
-    return _StoredImage((image.height, image.width), decode, _orientation(image), profile)
+        return _StoredImage(
+            size, lambda _: _decode_deep_png(file, image, layout), orientation, profile
+        )
+    return _StoredImage(size, partial(_decode, image, file), orientation)
 
 
 def _orientation(image: Image.Image) -> int:
@@ -176,14 +180,11 @@ def _decode(image: Image.Image, file: IO[bytes] | None, meaning: _Meaning) -> ND
     return np.array(image if image.mode in ("L", "RGB") else image.convert("RGB"))
 
 
-def _decode_deep_png(
-    file: IO[bytes], image: Image.Image, is_gray_alpha: bool, meaning: _Meaning
-) -> NDArray[Any]:
-    del meaning
+def _decode_deep_png(file: IO[bytes], image: Image.Image, layout: str) -> NDArray[Any]:
     load_whole(image, file)
     pixels = decode_by_opencv(file, cv2.IMREAD_UNCHANGED)
     pixels = pixels if pixels.ndim == 2 else pixels[..., 2::-1]
-    return pixels[..., 0] if is_gray_alpha else pixels
+    return pixels[..., 0] if layout.startswith("LA") else pixels
 
 
 def _deep_page(file: IO[bytes]) -> Any:
@@ -198,9 +199,8 @@ def _deep_page(file: IO[bytes]) -> Any:
     return None if is_shallow and page.index == 0 else page
 
 
-def _decode_deep_tiff(file: IO[bytes], page: Any, meaning: _Meaning) -> NDArray[Any]:
+def _decode_deep_tiff(file: IO[bytes], page: Any) -> NDArray[Any]:
     """Decode the gray or RGB pixels of a page, without alpha."""
-    del meaning
     channels = page.samplesperpixel
     colors = tifffile.PHOTOMETRIC.MINISBLACK if channels == 1 else tifffile.PHOTOMETRIC.RGB
     is_plain = channels in (1, 3, 4) and page.photometric == colors

@@ -130,6 +130,9 @@ class ScoreMosaic(Mosaic):
         backend: See `Mosaic`.
         spare: See `Mosaic`.
 
+    Attributes:
+        has_probabilities: True if sums of probabilities are kept.
+
     Raises:
         SettingError: See `Mosaic`.
     """
@@ -158,6 +161,7 @@ class ScoreMosaic(Mosaic):
             spare=spare,
         )
         self._min_confidence = min_confidence
+        self.has_probabilities = averaged
 
     @property
     def not_finite(self) -> Tensor:

@@ -303,7 +303,7 @@ def confusion_table(result: EvaluationResult) -> Table:
         (name, *(f"{100 * share:.0f}" if share >= 0.005 else "" for share in row))
         for name, row in zip(result.class_names, shares, strict=True)
     ]
-    note = "Rows: truth; columns: prediction; % of the row."
+    note = "Rows: ground truth; columns: prediction; % of the row."
     return Table("Confusion", ("", *result.class_names), rows, note, shades=shares.tolist())
 
 

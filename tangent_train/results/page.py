@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
+import sys
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -24,7 +27,7 @@ from tangent_train.results.tables import Table
 MOST_PIXELS = 4096
 """The longer side of an image in the report."""
 
-_MOST_DISTANCES = 2048
+_MOST_VALUES = 2048
 _THUMBNAIL_PIXELS = 216
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 88)
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6)
@@ -48,9 +51,10 @@ class EncodedImage(NamedTuple):
         thumbnail: Small JPEG of the image.
         prediction: 8-bit gray PNG of predicted labels, or RGB PNG of distances, which may have
             fewer pixels.
-        truth: The same of the truth.
+        truth: The same of the ground truth.
+        confidence: 8-bit gray PNG of the confidence of predicted labels.
         shares: ``(label, share of the truth, share of the prediction)`` of the labels that occur,
-            without shares of missing maps; by solid angle for panoramas.
+            the largest first, without shares of missing maps; by solid angle for panoramas.
         scale: Scale of the distances, see `pack_distances`; None for labels.
     """
 
@@ -63,6 +67,7 @@ class EncodedImage(NamedTuple):
     thumbnail: bytes
     prediction: bytes | None
     truth: bytes | None
+    confidence: bytes | None = None
     shares: Sequence[Sequence[float]] = ()
     scale: Mapping[str, Any] | None = None
 
@@ -74,6 +79,7 @@ def encode_image(
     *,
     prediction: NDArray[Any] | None = None,
     truth: NDArray[Any] | None = None,
+    confidence: NDArray[np.floating] | None = None,
     is_metric: bool = True,
     camera_matrix: NDArray[np.float64] | None = None,
     sphere: bool = True,
@@ -92,12 +98,13 @@ def encode_image(
         prediction: Predicted labels ``(h, w)``, which may have another size than the image; or
             distances from the center, which are z-depth with `camera_matrix`.
         truth: True labels or distances ``(h, w)``; 0 and NaN are unknown.
+        confidence: Confidence ``(h, w)`` of predicted labels, from 0 to 1.
         is_metric: True for distances in meters; False for distances up to a scale.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers, for points.
         sphere: True for a panorama.
         note: Line below the name.
     """
-    side, dtype = (MOST_PIXELS, np.uint8) if class_count else (_MOST_DISTANCES, np.float32)
+    side, dtype = (MOST_PIXELS, np.uint8) if class_count else (_MOST_VALUES, np.float32)
     maps = {
         key: _shrunk(array.astype(dtype, copy=False), side, cv2.INTER_NEAREST_EXACT)
         for key, array in (("truth", truth), ("prediction", prediction))
@@ -107,19 +114,23 @@ def encode_image(
     height, width = rgb.shape[:2]
     if class_count:
         shares = np.array([_shares(labels, class_count, sphere=sphere) for labels in maps.values()])
-        more["shares"] = [(k, *of) for k, of in enumerate(shares.T.tolist()) if any(of)]
+        seen = [(k, *of) for k, of in enumerate(shares.T.tolist()) if any(of)]
+        more["shares"] = sorted(seen, key=lambda entry: -max(entry[1:]))
     elif maps:
         camera = None
         if camera_matrix is not None:  # in widths and heights from the upper left corner
             (fx, _, cx), (_, fy, cy), _ = camera_matrix.tolist()
             camera = (fx / width, fy / height, (cx + 0.5) / width, (cy + 0.5) / height)
         more["scale"], maps = pack_distances(maps, camera, sphere=sphere, is_metric=is_metric)
+    if confidence is not None:
+        gray = np.asarray(255 * confidence, np.uint8)
+        maps["confidence"] = _shrunk(gray, _MOST_VALUES, cv2.INTER_AREA)
     pngs = {key: cv2.imencode(".png", array, _PNG)[1].tobytes() for key, array in maps.items()}
     more |= {
         key: cv2.imencode(".jpg", _shrunk(rgb, most, cv2.INTER_AREA)[..., ::-1], _JPEG)[1].tobytes()
         for key, most in (("input", MOST_PIXELS), ("thumbnail", _THUMBNAIL_PIXELS))
     }
-    more |= {key: pngs.get(key) for key in ("prediction", "truth")}
+    more |= {key: pngs.get(key) for key in ("prediction", "truth", "confidence")}
     return EncodedImage(name, note, sphere, width, height, **more)
 
 
@@ -212,7 +223,7 @@ def write_report(
     class_names: Sequence[str] = (),
     notes: Sequence[str] = (),
 ) -> None:
-    """Write a report as one HTML file, atomically.
+    """Write a report as one HTML file, atomically, with the date and the command.
 
     Args:
         path: File to write.
@@ -234,6 +245,8 @@ def write_report(
             shader=_resource("viewer.glsl"),
             scripts="\n".join(map(_resource, _SCRIPTS)),
         )
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    notes = [*notes, f"{datetime.now().astimezone():%Y-%m-%d %H:%M} · {command}"]
     page = _filled(
         "page.html",
         title=escape(title),

@@ -23,20 +23,32 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from tangent_train.heads.base import Head, PredictedImage
-    from tangent_train.io.inputs import Job, Video
+    from tangent_train.io.jobs import Job, Video
 
 Entry = dict[str, Any]
 """Entry of an image: name, file, rows, columns and its summary, or name and error."""
 
 
-def encode_prediction(head: Head, name: str, predicted: PredictedImage) -> EncodedImage:
-    """Compress an image for the report, to 0.1 to a few megabytes."""
+def encode_prediction(
+    head: Head, name: str, predicted: PredictedImage, confidence: NDArray[Any] | None = None
+) -> EncodedImage:
+    """Compress an image for the report, to 0.1 to a few megabytes.
+
+    Args:
+        head: Meaning of the pixels.
+        name: Name of the image.
+        predicted: Image with its prediction.
+        confidence: Confidence of the labels in the whole image.
+    """
     image, pixels, _ = predicted
+    note = "" if confidence is None else f"mean confidence {100 * confidence.mean():.0f}\u00a0%"
     return encode_image(
         name,
         image.rgb,
         len(head.class_names),
         prediction=pixels if image.area is None else image.area.place(pixels),
+        confidence=confidence,
+        note=note,
         is_metric=head.is_metric,
         camera_matrix=image.camera_matrix,
         sphere=image.camera_matrix is None,
@@ -51,11 +63,13 @@ class PredictionFolder:
         path: Folder.
         head: Formats of the files.
         kinds: Kinds of output to write.
+        title: Title of the report.
     """
 
     path: Path
     head: Head
     kinds: Sequence[str]
+    title: str = "Predictions"
 
     def files(self, job: Job) -> dict[str, Path]:
         """Return the files of an image by kind; the pixels of frames become videos of pictures."""
@@ -132,13 +146,16 @@ class PredictionFolder:
             shown: Compressed images for the viewer.
         """
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]
+        order = ", the least confident first" * any(image.confidence for image in shown)
         title = "Images that could not be used"
         errors = [Table(title, ("image", "error"), failed, text_columns=(0, 1))] if failed else []
         write_report(
             self.path / "report.html",
-            "Predictions",
+            self.title,
             tables=[self.table(entries), *errors],
             images=shown,
             class_names=self.head.class_names,
-            notes=[f"Shown: {len(shown)} of {counted(len(entries) - len(failed), 'images')}."],
+            notes=[
+                f"Shown: {len(shown)} of {counted(len(entries) - len(failed), 'images')}{order}."
+            ],
         )

@@ -58,6 +58,8 @@ class Task(lightning.LightningModule, ABC):
         metric: Metric of a split, see `Head.build_metric`.
         result: Value of `metric` after the last evaluation.
         evaluated: Number of images or shapes in that evaluation.
+        confidences: Confidence of the labels of panoramas ``(H, W)``, to which `evaluate` appends
+            those whose mosaics keep probabilities; None to leave them out.
         fresh: Names of the network's tensors that were not loaded from the file of ``init_from``;
             None without such a file. Stored in checkpoints.
 
@@ -103,6 +105,7 @@ class Task(lightning.LightningModule, ABC):
         self._frozen = tuple(freeze(self.network, frozen))
         self.monitor = f"val/{head.main_score}"
         self.metric: Any = head.build_metric()
+        self.confidences: list[Any] | None = None
         # Images, validation loss and its norm: not a buffer, which would be of half precision.
         self._sums = torch.zeros(3)
         self._pending: tuple[Tensor, Any, Any] | None = None
@@ -459,6 +462,8 @@ class PixelTask(Task):
                 lengths = torch.from_numpy(views.ray_lengths()).to(scores.device)
                 targets = self.head.targets(_labels_of_views(truth, views), lengths)
                 self.add_validation_loss(outputs, targets)
+        if self.confidences is not None and getattr(mosaic, "has_probabilities", False):
+            self.confidences.append(mosaic.confidences())
         return mosaic.pixels().to(images.device)
 
 

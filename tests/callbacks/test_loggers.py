@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from collections import defaultdict
 from functools import partial
 from pathlib import Path
@@ -24,7 +23,6 @@ from torch import nn
 from datamodules.core.dataset import render_inputs
 from datamodules.core.inputs import normalize
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from tangent_train.callbacks import loggers
 from tangent_train.callbacks.loggers import start_loggers
 from tangent_train.callbacks.pictures import log_image
 from tangent_train.cli.run import Run
@@ -213,23 +211,6 @@ def test_a_logger_that_is_new_to_a_resumed_run_gets_its_settings(tmp_path: Path)
     text = (tmp_path / "csv" / "version_0" / "metrics.csv").read_text()
     rows = csv.DictReader(text.splitlines())
     assert [row["step"] for row in rows] == ["4", "5"]
-
-
-def test_a_server_that_does_not_answer_is_named_soon(tmp_path: Path, monkeypatch: Any) -> None:
-    """Of the variables of MLflow, those of the user hold."""
-    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
-    found: dict[str, str | None] = {}
-
-    def start(*_: Any) -> Any:
-        names = ("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "MLFLOW_HTTP_REQUEST_TIMEOUT")
-        found.update({name: os.environ.get(name) for name in names})
-        raise RuntimeError("no answer")
-
-    monkeypatch.setattr(loggers, "_build", start)
-    with pytest.raises(SettingError, match="found no answer"):
-        _log(tmp_path, range(1), "logger=mlflow")
-    assert [*found.values()] == ["0", "15"]
-    assert "MLFLOW_HTTP_REQUEST_TIMEOUT" not in os.environ
 
 
 def test_a_failing_logger_is_named_in_one_line(

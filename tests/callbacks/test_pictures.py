@@ -44,10 +44,12 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
         labels = torch.ones((2, *SHAPE), dtype=torch.uint8)
         prediction = labels.clone().long()
         prediction.flatten(1)[:, 0] = 2
+        if first == 8:
+            prediction[1, 1, :2] = 2  # room 9 is the worst
         batch = SimpleNamespace(index=torch.tensor([first, first + 1]), labels=labels)
         panels.on_test_batch_end(trainer, task, prediction, batch, first // 2)
     panels.on_test_end(trainer, task)
-    chosen = (0, 3, 6, 9)
+    chosen = (9, 0, 3, 6)
     assert [image.name for image in panels.images] == [f"area/room {k}" for k in chosen]
     assert {path.stem for path in tmp_path.iterdir()} == {f"{k}_area_room {k}" for k in chosen}
     for image, k in zip(panels.images, chosen, strict=True):
@@ -56,5 +58,6 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
         assert np.all(decoded(image.truth) == 1)
         shown = decoded(image.prediction)
         assert shown[0, 0] == 2
-        assert np.count_nonzero(shown == 1) == 127
-        assert image.note == f"mIoU {100 * 127 / 128:.1f}\u00a0%", "the floor is not in the truth"
+        correct = 125 if k == 9 else 127
+        assert np.count_nonzero(shown == 1) == correct
+        assert image.note == f"mIoU {100 * correct / 128:.1f}\u00a0%", "there is no floor"

@@ -119,12 +119,12 @@ def test_an_interrupted_video_is_resumed(
                 raise KeyboardInterrupt
             yield frame
 
-    monkeypatch.setattr("tangent_train.io.inputs.read_frames", interrupted)
+    monkeypatch.setattr("tangent_train.io.jobs.read_frames", interrupted)
     with pytest.raises(SystemExit) as stopped:
         predict(input=video)
     assert stopped.value.code == 130
     assert not (tmp_path / "out" / "overlay").exists()
-    monkeypatch.setattr("tangent_train.io.inputs.read_frames", read_frames)
+    monkeypatch.setattr("tangent_train.io.jobs.read_frames", read_frames)
     before = (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns
     predict(input=video)
     assert (tmp_path / "out" / "labels" / "walk" / "000003.png").stat().st_mtime_ns == before

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -136,7 +137,7 @@ def test_a_region_without_a_picture_is_gray_and_unknown() -> None:
     np.testing.assert_array_equal(shown[:, 0, 0], [136, 0, 9, 9])
     np.testing.assert_array_equal(np.stack(maps)[:, :, 0], [[0, 1, 0, 2], [0, 1, 1, 1]])
     distances = torch.where(truth > 0, 2.5, torch.nan)
-    _, *maps = shown_arrays(image, distances, torch.full((4, 8), 2.0), None)
+    _, *maps = shown_arrays(image, distances, torch.full((4, 8), 2.0), None, unknown=math.nan)
     np.testing.assert_array_equal(maps[1][:, 0], [np.nan, 2, 2, 2])
 
 

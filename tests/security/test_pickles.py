@@ -19,7 +19,7 @@ from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError
 from tangent_train.heads import ClassesHead
 from tangent_train.io.image_files import short_names
-from tangent_train.io.inputs import Job
+from tangent_train.io.jobs import Job
 from tangent_train.io.pixel_files import read_image_size, write_pixels
 from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command

@@ -16,7 +16,7 @@ from studies.constant_depth import constants
 from studies.depth_alignment import depth_alignment
 from studies.distorted_digits import BODY, distort, enlarge, mean_enlargement, pixel_centers
 from studies.fov import fov
-from studies.methods import picture, table
+from studies.methods import KINDS, picture, table
 from studies.output import markdown
 from studies.point_views import SIDE, drawn
 from studies.representation_distortion import representation_distortion
@@ -120,8 +120,11 @@ def test_rotation_errors_are_those_of_the_network() -> None:
 
 
 def test_the_chart_of_methods_names_every_method_once() -> None:
+    names = [*table("prior_methods_step")]
+    for axes in picture().axes:
+        assert sorted(text.get_text() for text in axes.texts) == sorted(names)
     (legend,) = picture().legends
-    assert [text.get_text() for text in legend.get_texts()] == [*table("prior_methods_step")]
+    assert [text.get_text() for text in legend.get_texts()] == [*KINDS]
 
 
 def test_constant_depths_minimize_their_errors() -> None:

@@ -1,9 +1,10 @@
 // What draws: WebGL 2, or where there is none the flat image on an ordinary canvas.
 
-const LAYERS = ["input", "truth", "prediction", "error", "overlay"];
-const MAPS = ["truth", "prediction"];
+const LAYERS = ["input", "truth", "prediction", "error", "overlay", "confidence"];
+const MAPS = ["truth", "prediction", "confidence"];
 const WRONG = [214, 39, 40];
-const UNLABELED = [110, 110, 110];
+const UNLABELED = [136, 136, 136];
+const UNSURE = [94, 60, 153];
 const WORST = Math.log(1.25); // relative error of a distance that is wholly red
 
 async function decode(base64, type, mostPixels) {
@@ -139,16 +140,17 @@ class GlSurface {
     const { gl } = this;
     const entries = new Uint8Array(4 * 256);
     colors.forEach((rgb, k) => entries.set([...rgb, hidden.has(k) ? 0 : 255], 4 * k));
-    gl.activeTexture(gl.TEXTURE3);
+    gl.activeTexture(gl.TEXTURE1 + MAPS.length);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, entries);
   }
 
-  draw(view, layer, opacity, pointer) {
+  draw(view, layer, opacity, swipe, pointer) {
     const { gl } = this;
     gl.viewport(0, 0, gl.canvas.width, gl.canvas.height);
     this.set("uniform2f", "uCanvas", gl.canvas.width, gl.canvas.height);
     this.set("uniform1f", "uReach", view.reach);
     this.set("uniform1f", "uOpacity", opacity);
+    this.set("uniform1f", "uSwipe", swipe);
     this.set("uniform1i", "uLayer", LAYERS.indexOf(layer));
     if (view instanceof Scene) {
       this.drawPoints(view, layer === "truth" || !this.sizes.prediction, pointer);
@@ -229,6 +231,7 @@ class FlatSurface {
       const scratch = new OffscreenCanvas(width, height).getContext("2d", settings);
       scratch.imageSmoothingEnabled = false;
       scratch.drawImage(bitmap, 0, 0, width, height);
+      if (kind === "input") this.photo = scratch.canvas;
       this.pixels[kind] = scratch.getImageData(0, 0, width, height).data;
       bitmap.close();
     }
@@ -239,8 +242,8 @@ class FlatSurface {
     [this.colors, this.hidden, this.painted] = [colors, hidden, null];
   }
 
-  draw(view, layer, opacity) {
-    const { context, sheet } = this;
+  draw(view, layer, opacity, swipe) {
+    const { context } = this;
     const { canvas } = context;
     if (this.painted !== layer + opacity) this.compose(layer, opacity);
     this.painted = layer + opacity;
@@ -250,8 +253,16 @@ class FlatSurface {
     context.fillStyle = "#16181c";
     context.fillRect(0, 0, canvas.width, canvas.height);
     const top = canvas.height / 2 - view.v * height;
-    for (const turn of view.image.sphere ? [-1, 0, 1] : [0]) {
-      context.drawImage(sheet, left + turn * width, top, width, height);
+    const divider = layer === "input" ? 0 : swipe * canvas.width;
+    for (const [sheet, from, to] of [[this.photo, 0, divider], [this.sheet, divider, canvas.width]]) {
+      context.save();
+      context.beginPath();
+      context.rect(from, 0, to - from, canvas.height);
+      context.clip();
+      for (const turn of view.image.sphere ? [-1, 0, 1] : [0]) {
+        context.drawImage(sheet, left + turn * width, top, width, height);
+      }
+      context.restore();
     }
   }
 
@@ -262,22 +273,30 @@ class FlatSurface {
     for (let k = 0; k < input.length; k += 4) {
       const under = [input[k], input[k + 1], input[k + 2]];
       const values = MAPS.map((kind) => this.pixels[kind]?.subarray(k, k + 2));
-      const color = layer === "input" ? under : shown.call(this, layer, opacity, under, ...values);
+      const strength = this.isOutline(k) ? Math.min(2.5 * opacity, 1) : opacity;
+      const color = layer === "input" ? under : shown.call(this, layer, strength, under, ...values);
       result.data.set([...color, 255], k);
     }
     this.sheet.getContext("2d").putImageData(result, 0, 0);
   }
 
+  isOutline(k) {
+    const map = this.distances ? [] : (this.pixels.prediction ?? this.pixels.truth ?? []);
+    return [4, 4 * this.sheet.width].some((step) => k + step < map.length && map[k] !== map[k + step]);
+  }
+
   // One pixel, as in the shader.
-  ofLabels(layer, opacity, under, [truth] = [0], [prediction] = [truth]) {
+  ofLabels(layer, opacity, under, [truth] = [0], [prediction] = [truth], [sure] = [0]) {
     const index = layer === "truth" || layer === "error" ? truth : prediction;
     const visible = !this.hidden.has(index);
     const gray = 0.299 * under[0] + 0.587 * under[1] + 0.114 * under[2];
     if (layer === "overlay") return visible && index ? mix(under, this.colors[index], opacity) : under;
+    const pale = Array(3).fill(191.25 + 0.25 * gray);
+    if (layer === "confidence") return prediction ? mix(UNSURE, pale, sure / 255) : UNLABELED;
     if (!visible) return Array(3).fill(0.4 * gray);
     if (layer !== "error") return this.colors[index];
     if (!truth) return UNLABELED;
-    return truth === prediction ? Array(3).fill(191.25 + 0.25 * gray) : WRONG;
+    return truth === prediction ? pale : WRONG;
   }
 
   ofDistances(layer, opacity, under, ...values) {

@@ -12,14 +12,16 @@ const float WORST = 0.22314355;  // ln 1.25
 const int REACH = 2;  // pixels between neighbors that tell which way a surface faces
 const float STEEP = 12.0;  // slope of a surface, seen from the center, of 85 degrees
 const int INSIDE = 0, PLANET = 1, FLAT = 2;
-const int INPUT = 0, TRUTH = 1, PREDICTION = 2, ERROR = 3, OVERLAY = 4;
+const int INPUT = 0, TRUTH = 1, PREDICTION = 2, ERROR = 3, OVERLAY = 4,
+    CONFIDENCE = 5;
 const vec3 OUTSIDE = vec3(0.086, 0.094, 0.11);
-const vec3 WRONG = vec3(214.0, 39.0, 40.0) / 255.0, UNLABELED = vec3(110.0 / 255.0);
+const vec3 WRONG = vec3(214.0, 39.0, 40.0) / 255.0, UNLABELED = vec3(136.0 / 255.0);
+const vec3 UNSURE = vec3(94.0, 60.0, 153.0) / 255.0;
 // Four samples in a turned square: class borders without steps.
 const vec2 OFFSETS[4] =
     vec2[](vec2(-0.125, -0.375), vec2(0.375, -0.125), vec2(0.125, 0.375), vec2(-0.375, 0.125));
 
-uniform sampler2D uInput, uTruth, uPrediction;
+uniform sampler2D uInput, uTruth, uPrediction, uConfidence;
 uniform sampler2D uColors;    // of the classes, alpha 0: hidden; or from near to far
 uniform vec4 uScale;          // logarithms of the distances: nearest, farthest, first, last color
 uniform vec2 uCanvas;         // pixels
@@ -27,6 +29,7 @@ uniform vec2 uCenter;         // u, v in the middle of the canvas
 uniform float uReach;         // tangent plane, stereographic plane or u at half the longer side
 uniform float uAspect;        // width of the image over its height
 uniform float uOpacity;
+uniform float uSwipe;         // share of the canvas that shows the input, from the left
 uniform int uProjection, uLayer;
 uniform bool uSphere, uHasTruth, uHasPrediction, uHasDistances;
 uniform bool uPick;           // points in the colors of their numbers
@@ -167,18 +170,27 @@ int classAt(sampler2D labels, vec2 uv) {
   return int(round(texelFetch(labels, pixelAt(labels, uv), 0).r * 255.0));
 }
 
-vec3 labels(vec3 photo, vec2 uv, float gray) {
+int overlaid(vec2 uv) {
+  return uHasPrediction ? classAt(uPrediction, uv) : classAt(uTruth, uv);
+}
+
+vec3 labels(vec3 photo, vec2 uv, float gray, float opacity) {
   int truth = uHasTruth ? classAt(uTruth, uv) : 0;
   int prediction = uHasPrediction ? classAt(uPrediction, uv) : 0;
   bool byTruth = uLayer == TRUTH || uLayer == ERROR || !uHasPrediction;
   int index = byTruth ? truth : prediction;
   vec4 entry = texelFetch(uColors, ivec2(index, 0), 0);
   bool visible = entry.a > 0.5;
-  if (uLayer == OVERLAY) return visible && index > 0 ? mix(photo, entry.rgb, uOpacity) : photo;
+  if (uLayer == OVERLAY) return visible && index > 0 ? mix(photo, entry.rgb, opacity) : photo;
+  vec3 pale = vec3(0.75 + 0.25 * gray);
+  if (uLayer == CONFIDENCE) {
+    float sure = texelFetch(uConfidence, pixelAt(uConfidence, uv), 0).r;
+    return prediction == 0 ? UNLABELED : mix(UNSURE, pale, sure);
+  }
   if (!visible) return vec3(0.4 * gray);
   if (uLayer != ERROR) return entry.rgb;
   if (truth == 0) return UNLABELED;
-  return truth == prediction ? vec3(0.75 + 0.25 * gray) : WRONG;
+  return truth == prediction ? pale : WRONG;
 }
 
 vec3 distances(vec3 photo, vec2 uv, float gray) {
@@ -195,10 +207,10 @@ vec3 distances(vec3 photo, vec2 uv, float gray) {
   return uLayer == OVERLAY ? mix(photo, entry, uOpacity) : entry;
 }
 
-vec3 shown(vec3 photo, vec2 uv) {
+vec3 shown(vec3 photo, vec2 uv, float opacity) {
   if (uLayer == INPUT) return photo;
   float gray = dot(photo, vec3(0.299, 0.587, 0.114));
-  return uHasDistances ? distances(photo, uv, gray) : labels(photo, uv, gray);
+  return uHasDistances ? distances(photo, uv, gray) : labels(photo, uv, gray, opacity);
 }
 
 #ifdef POINTS
@@ -206,7 +218,7 @@ flat in vec2 vUv;
 flat in vec3 vNumber;
 
 void main() {
-  color = vec4(uPick ? vNumber : shown(photo(vUv, 0.0), vUv), 1.0);
+  color = vec4(uPick ? vNumber : shown(photo(vUv, 0.0), vUv, uOpacity), 1.0);
 }
 #else
 void main() {
@@ -218,7 +230,21 @@ void main() {
     return;
   }
   vec3 under = photo(uv, level), sum = vec3(0.0);
-  for (int k = 0; k < 4; k++) sum += shown(under, imageAt(pixel + OFFSETS[k]));
+  float divider = uSwipe * uCanvas.x - pixel.x;
+  if (divider > 0.0) {
+    color = vec4(divider < 2.0 ? vec3(1.0) : under, 1.0);
+    return;
+  }
+  // Overlaid classes have outlines of their full color, 2 to 3 pixels of the canvas wide.
+  float opacity = uOpacity;
+  if (uLayer == OVERLAY && !uHasDistances) {
+    int here = overlaid(uv);
+    for (int k = 0; k < 4; k++) {
+      vec2 near = imageAt(pixel + 4.0 * OFFSETS[k]);
+      if (inside(near) && overlaid(near) != here) opacity = min(2.5 * uOpacity, 1.0);
+    }
+  }
+  for (int k = 0; k < 4; k++) sum += shown(under, imageAt(pixel + OFFSETS[k]), opacity);
   color = vec4(sum / 4.0, 1.0);
 }
 #endif

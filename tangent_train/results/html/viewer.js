@@ -1,5 +1,7 @@
 // The viewer of a report: one panorama or photo at a time, decoded when it is chosen.
 
+const nameOf = (kind) => (kind === "truth" ? "ground truth" : kind);
+
 class Viewer {
   constructor(section) {
     this.section = section;
@@ -8,7 +10,8 @@ class Viewer {
     this.nearToFar = JSON.parse(document.getElementById("distances").textContent);
     this.hidden = new Set();
     this.layer = "overlay";
-    this.opacity = 0.55;
+    this.opacity = 0.4;
+    this.swipe = 0;
     this.views = [new View(), new Scene()];
     this.inPoints = false;
     this.surface = this.open();
@@ -139,9 +142,9 @@ class Viewer {
   // Legend ------------------------------------------------------------------------------------
 
   fillLegend() {
-    const columns = this.distances ? [] : MAPS.filter((kind) => this.data[kind]);
+    const columns = this.distances ? [] : MAPS.slice(0, 2).filter((kind) => this.data[kind]);
     this.find(".legend").hidden = columns.length === 0;
-    this.find(".shares").textContent = columns.length ? `share of ${columns.join(" / ")}, %` : "";
+    this.find(".shares").textContent = columns.length ? `share of ${columns.map(nameOf).join(" / ")}, %` : "";
     const entries = this.data.shares.map(([index, ...shares]) => this.legendEntry(index, shares));
     this.find(".legend strong").textContent = `Classes (${entries.length})`;
     this.find(".legend ul").replaceChildren(...entries);
@@ -149,15 +152,26 @@ class Viewer {
 
   fillScale() {
     const scale = this.find(".scale");
-    scale.hidden = !this.distances || this.layer === "input";
+    const isConfidence = this.layer === "confidence";
+    scale.hidden = this.layer === "input" || !(this.distances || isConfidence);
     if (scale.hidden) return;
+    if (isConfidence) {
+      this.drawScale("confidence", [UNSURE, Array(3).fill(242)], ["0", "50 %", "100 %"]);
+      return;
+    }
     const { noun, unit, limits, colors } = this.distances;
     const isError = this.layer === "error";
-    const shown = (isError ? [Array(3).fill(242), WRONG] : colors).map((rgb) => `rgb(${rgb.join(" ")})`);
+    const shown = isError ? [Array(3).fill(242), WRONG] : colors;
     const middle = Math.sqrt(limits[0] * limits[1]); // colors follow the logarithm
     const numbers = [limits[0], middle, limits[1]].map((value) => this.distances.number(value));
     const ends = isError ? ["0", "0.11", "≥ 0.22"] : numbers;
-    const title = isError ? "|ln(prediction / truth)|" : `${noun}, ${unit}`;
+    const title = isError ? "|ln(prediction / ground truth)|" : `${noun}, ${unit}`;
+    this.drawScale(title, shown, ends);
+  }
+
+  drawScale(title, colors, ends) {
+    const scale = this.find(".scale");
+    const shown = colors.map((rgb) => `rgb(${rgb.join(" ")})`);
     scale.querySelector(".title").textContent = title;
     scale.querySelector(".ramp").style.background = `linear-gradient(to right, ${shown.join(", ")})`;
     scale.querySelectorAll(".ends span").forEach((end, k) => (end.textContent = ends[k]));
@@ -169,7 +183,7 @@ class Viewer {
     [box.checked, box.value] = [!this.hidden.has(index), index];
     entry.querySelector(".swatch").style.background = `rgb(${this.classes[index].rgb.join(" ")})`;
     entry.querySelector(".name").textContent = this.classes[index].name;
-    const percent = (share) => (share === 0 ? "–" : (100 * share).toFixed(1));
+    const percent = (share) => (share === 0 ? "–" : share < 5e-4 ? "< 0.1" : (100 * share).toFixed(1));
     entry.querySelector(".share").textContent = shares.map(percent).join(" / ");
     return entry;
   }
@@ -199,7 +213,8 @@ class Viewer {
     const height = Math.max(1, Math.round(canvas.clientHeight * density));
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     view.resize(canvas.clientWidth, canvas.clientHeight);
-    this.surface.draw(view, this.layer, this.opacity, this.gestures.pointer);
+    this.surface.draw(view, this.layer, this.opacity, this.swipe, this.gestures.pointer);
+    this.find(".swipe").hidden = this.inPoints || this.layer === "input";
     this.find(".looking").textContent = this.inPoints ? this.seenFrom(view) : this.lookingAt(view);
     this.readOut();
   }
@@ -240,9 +255,10 @@ class Viewer {
   valueText(kind, at) {
     const bytes = this.surface.valueAt(kind, at);
     if (!bytes) return null;
-    if (!this.distances) return `${kind}: ${this.classes[bytes[0]]?.name ?? bytes[0]}`;
+    if (kind === "confidence") return `${kind}: ${Math.round(bytes[0] / 2.55)} %`;
+    if (!this.distances) return `${nameOf(kind)}: ${this.classes[bytes[0]]?.name ?? bytes[0]}`;
     const log = this.distances.log(bytes[0], bytes[1]);
-    return `${kind}: ${log === null ? "unknown" : this.distances.text(Math.exp(log))}`;
+    return `${nameOf(kind)}: ${log === null ? "unknown" : this.distances.text(Math.exp(log))}`;
   }
 
   // Events ------------------------------------------------------------------------------------
@@ -266,6 +282,10 @@ class Viewer {
       this.surface.build();
       this.say("");
       this.choose(this.current);
+    });
+    this.find(".swipe input").addEventListener("input", (event) => {
+      this.swipe = event.target.value / 100;
+      this.redraw();
     });
     this.find(".full").hidden = !document.fullscreenEnabled;
     new ResizeObserver(() => this.redraw()).observe(canvas);

@@ -114,7 +114,7 @@ class OpenReport:
         for shown in ("hidden", ""):
             if shown == "":
                 png = self.page.screenshot(clip=self._clip())
-            above = self.page.locator(".buttons, .errors")
+            above = self.page.locator(".buttons, .errors, .scale")
             above.evaluate_all("(all, v) => all.forEach((e) => (e.style.visibility = v))", shown)
         pixels: Any = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
         return pixels[..., ::-1].astype(np.int64)

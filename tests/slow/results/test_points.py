@@ -26,7 +26,7 @@ from tests.slow.results.browser import OpenReport, close, opened
 SIZE, PHOTO, FOV_DEG = (500, 1000), (300, 400), 80.0
 CENTER = np.zeros(3)
 HALF_ANGLE = math.radians(25)  # from the middle of the picture to the end of its longer side
-OUTSIDE, WRONG, UNLABELED = (22, 24, 28), (214, 39, 40), (110, 110, 110)
+OUTSIDE, WRONG, UNLABELED = (22, 24, 28), (214, 39, 40), (136, 136, 136)
 
 
 def room(directions: NDArray[np.float64], **kwargs: Any) -> EncodedImage:
@@ -183,7 +183,7 @@ def test_layers_show_distances_and_their_errors(report: OpenReport) -> None:
         "truth": np.where(is_known, colorize_distance(truth, limits), dark),
         "prediction": painted,
         "error": np.where(is_known, light + share * (WRONG - light), UNLABELED),
-        "overlay": 0.45 * photo + 0.55 * painted,
+        "overlay": 0.6 * photo + 0.4 * painted,
     }
     report.project("flat")
     width, height = report.box()[2:]
@@ -195,7 +195,12 @@ def test_layers_show_distances_and_their_errors(report: OpenReport) -> None:
         shown = report.pixels()[round(top) + 2 :][: len(v)]
         close(shown, colors[v][:, u], but=0.03)
     report.layer("error")
-    assert report.text(".scale").split("\n") == ["|ln(prediction / truth)|", "0", "0.11", "≥ 0.22"]
+    assert report.text(".scale").split("\n") == [
+        "|ln(prediction / ground truth)|",
+        "0",
+        "0.11",
+        "≥ 0.22",
+    ]
     assert not report.page.locator(".errors").is_visible()
     report.layer("truth")
     title, *ends = report.text(".scale").split("\n")
@@ -205,4 +210,4 @@ def test_layers_show_distances_and_their_errors(report: OpenReport) -> None:
     )
     report.project("inside")
     ahead = np.linalg.norm(exit_points(CENTER, np.array([1.0, 0, 0])))
-    assert f"truth: {ahead:.2f} m · prediction: {ahead:.2f} m" in report.text(".readout")
+    assert f"ground truth: {ahead:.2f} m · prediction: {ahead:.2f} m" in report.text(".readout")

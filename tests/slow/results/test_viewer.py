@@ -24,7 +24,7 @@ PHOTO = (120, 200)
 NAMES = ("unknown", *(f"octant {k}" for k in range(1, 8)), "<i>last</i>")
 COLORS = class_colors(NAMES).astype(np.int64)
 START_DEG, PLANET_DEG = 95.0, 250.0
-WRONG, UNLABELED = (214, 39, 40), (110, 110, 110)
+WRONG, UNLABELED, UNSURE = (214, 39, 40), (136, 136, 136), (94, 60, 153)
 
 
 def colors_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -41,6 +41,12 @@ def classes_of(directions: NDArray[np.float64]) -> NDArray[np.uint8]:
     return classes
 
 
+def confidence_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0.2 below to 0.8 above."""
+    confidence: NDArray[np.float64] = 0.5 + 0.3 * directions[..., 2]
+    return confidence
+
+
 def panorama() -> EncodedImage:
     directions = equirect_directions((HEIGHT, WIDTH))
     truth = classes_of(directions)
@@ -48,7 +54,12 @@ def panorama() -> EncodedImage:
     prediction[directions[..., 1] < -0.9] = 8
     rgb = colors_of(directions).round().astype(np.uint8)
     name, note = "a <b>sphere</b>", "mIoU 61.2 %"
-    return encode_image(name, rgb, len(NAMES), prediction=prediction, truth=truth, note=note)
+    maps: dict[str, Any] = {
+        "prediction": prediction,
+        "truth": truth,
+        "confidence": confidence_of(directions),
+    }
+    return encode_image(name, rgb, len(NAMES), note=note, **maps)
 
 
 def photo() -> EncodedImage:
@@ -178,7 +189,9 @@ def test_layers_show_the_colors_of_their_classes(report: OpenReport) -> None:
         "truth": COLORS[truth],
         "prediction": COLORS[prediction],
         "error": error,
-        "overlay": 0.45 * photo + 0.55 * COLORS[prediction],
+        "confidence": UNSURE
+        + confidence_of(view)[..., None] * (191.25 + 0.25 * gray - np.array(UNSURE)),
+        "overlay": 0.6 * photo + 0.4 * COLORS[prediction],
     }
     for layer, colors in expected.items():
         report.layer(layer)
@@ -186,7 +199,68 @@ def test_layers_show_the_colors_of_their_classes(report: OpenReport) -> None:
         close(report.pixels(), colors, but=0.03)
     assert not report.page.locator(".errors").is_visible()
     report.layer("error")
-    assert report.text(".errors").split() == ["right", "wrong", "unlabeled"]
+    assert report.text(".errors").split() == ["correct", "wrong", "no", "ground", "truth"]
+
+
+def overlaid(report: OpenReport, view: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The overlay without outlines."""
+    classes = np.where(view[..., 1] < -0.9, 8, np.maximum(classes_of(view), 1))
+    colors: NDArray[np.float64] = 0.6 * colors_of(view) + 0.4 * COLORS[classes]
+    return colors
+
+
+def test_overlaid_classes_have_outlines_of_their_colors(report: OpenReport) -> None:
+    report.drag(130, 40)
+    step = math.degrees(step_rad(report))
+    view = view_of(report, -130 * step, 40 * step, START_DEG)
+    shown = report.pixels()
+    is_outline = np.abs(shown - overlaid(report, view)).max(axis=-1) > 12
+    assert 0.001 < is_outline.mean() < 0.04
+    distances = np.abs(shown[is_outline][:, None] - COLORS).max(axis=-1).min(axis=1)
+    assert np.mean(distances < 30) > 0.6
+
+
+def swipe(report: OpenReport, percent: int) -> None:
+    report.page.locator(".swipe input").fill(str(percent))
+    report.drawn()
+
+
+@pytest.mark.parametrize("is_flat", [False, True])
+def test_a_swipe_shows_the_input_on_the_left(
+    browser: Browser, page_path: Path, *, is_flat: bool
+) -> None:
+    """With WebGL, and without it on the flat image."""
+    without = "HTMLCanvasElement.prototype.getContext = new Proxy("
+    without += "HTMLCanvasElement.prototype.getContext, {apply: (target, canvas, [kind, ...how]) =>"
+    without += " kind === 'webgl2' ? null : Reflect.apply(target, canvas, [kind, ...how])})"
+    with opened(browser, page_path, before=without if is_flat else "") as report:
+        if not is_flat:
+            report.project("flat")
+        layers = {}
+        for layer in ("input", "prediction"):
+            report.layer(layer)
+            layers[layer] = report.pixels()
+        swipe(report, 25)
+        height, width = report.pixels().shape[:2]
+        middle = slice(height // 2 - 50, height // 2 + 50)
+        column = width // 4
+        shown = report.pixels()[middle]
+        close(shown[:, : column - 4], layers["input"][middle][:, : column - 4], but=0.01)
+        close(shown[:, column + 4 :], layers["prediction"][middle][:, column + 4 :], but=0.01)
+        report.layer("input")
+        assert not report.page.locator(".swipe").is_visible()
+        report.layer("confidence")
+        assert report.text(".scale").split("\n") == ["confidence", "0", "50 %", "100 %"]
+
+
+def test_the_readout_and_the_legend_name_the_ground_truth(report: OpenReport) -> None:
+    assert "ground truth: unknown · prediction: octant 1 · confidence: 50 %" in report.text(
+        ".readout"
+    )
+    assert report.text(".shares") == "share of ground truth / prediction, %"
+    shares = report.page.locator(".legend .share").all_inner_texts()
+    largest = [max(float(k.replace("–", "0")) for k in text.split(" / ")) for text in shares]
+    assert largest == sorted(largest, reverse=True)
 
 
 def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
