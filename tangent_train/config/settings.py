@@ -478,6 +478,24 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
         "trainer.(overfit|reload|sync|val)_.*",
     )
 
+    checkpoint: ExistingPath | None = None  # type: ignore[assignment]
+    """network, written by tangent-train, tangent-import or tangent-export; null with predictions"""
+    predictions: ExistingPath | None = None
+    """folder of predictions of any program, which are scored instead of a network: label maps,
+    class scores or distances of panoramas, named as the images"""
+    values: str | None = None
+    """predictions: values of the classes in label maps: from_1 (0 is unknown) | from_0 | ids (those
+    of the data set's own files) | a JSON file as classes.json, also with colors; null = by
+    classes.json in the folder, else from_1"""
+    files: ExistingPath | None = None
+    """predictions: CSV file with the columns image and prediction; null = by the names of files"""
+    resample: Literal["nearest", "linear"] | None = None
+    """predictions: brings other sizes to that of the labels: nearest | linear (distances); null =
+    other sizes are not scored"""
+    depth_scale: PositiveFloat = 1000
+    """predictions: units per meter in depth files of integers"""
+    depth_channel: str | None = None
+    """predictions: channel of OpenEXR files; null = as tangent-predict"""
     representation: Section | None = None  # type: ignore[assignment]
     """views of a panorama that the network receives; null = as in the checkpoint"""
     level: Level | None = None  # type: ignore[assignment]

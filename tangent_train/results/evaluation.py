@@ -233,6 +233,13 @@ def result_tables(result: EvaluationResult) -> list[Table]:
         result: The evaluation.
     """
     tables = [_per_class(result) if result.classes else _over_all(result)]
+    of_sphere = [
+        [column.title, _mean(result, name)]
+        for name, column in result.columns.items()
+        if column.of_sphere and result.scores.get(name) is not None
+    ]
+    if of_sphere:
+        tables.append(Table("On the sphere", ("score", f"over all {result.noun}"), of_sphere))
     bands = [
         {"latitude": "{}° … {}°".format(*band["latitude_deg"]), **band}
         for band in result.latitude_bands
@@ -266,7 +273,7 @@ def _over_all(result: EvaluationResult) -> Table:
     rows = [
         [column.title, _mean(result, name)]
         for name, column in result.columns.items()
-        if _is_shown(result, name)
+        if _is_shown(result, name) and not column.of_sphere
     ]
     return Table("Scores", ("score", f"over all {result.noun}"), rows)
 
