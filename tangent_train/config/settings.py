@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
@@ -338,20 +338,18 @@ class ImportSettings(Settings):
     overwrite: bool = False
     """true: replace an existing file"""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _check_source(cls, values: dict[str, Any]) -> dict[str, Any]:
+    @model_validator(mode="after")
+    def _check_source(self) -> Self:
         """Refuse settings that name no trained network."""
-        is_own = values.get("network") is not None
-        if values.get("library") is None and not (is_own and values.get("weights")):
+        if self.library is None and None in (self.network, self.weights):
+            expected = "library=torchvision, huggingface, smp or onnx; or network= with weights="
             raise SettingError(
-                "weights" if is_own else "library",
+                "library" if self.network is None else "weights",
                 found="null",
-                expected="a trained network: library=torchvision, huggingface, smp or onnx; or "
-                "network= with weights=<its file>",
+                expected=f"a trained network: {expected}<its file>",
                 remedy=f"Example: {_example('import')}",
             )
-        return values
+        return self
 
 
 class KeypointSettings(Settings):
