@@ -13,7 +13,8 @@ from lightning.pytorch.utilities import rank_zero_only
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
-from tangent_train.config.settings import EvaluateSettings
+from tangent_train.cli.scored_files import OF_FILES, score_files
+from tangent_train.config.settings import EvaluateSettings, refuse_typed
 from tangent_train.errors import SettingError, listed
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
@@ -28,6 +29,13 @@ def evaluate(settings: EvaluateSettings) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     _refuse_folder_of_run(folder)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
+    if settings.predictions is not None:
+        score_files(settings, folder)
+        return
+    refuse_typed(OF_FILES, "nothing: it is read with predictions=")
+    if settings.checkpoint is None:
+        expected = "a network, or predictions=<folder>"
+        raise SettingError("checkpoint", found="null", expected=expected)
     loaded = load_network(settings.checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])
