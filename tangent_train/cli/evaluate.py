@@ -33,10 +33,10 @@ def evaluate(settings: EvaluateSettings) -> None:
         score_files(settings, folder)
         return
     refuse_typed(OF_FILES, "nothing: it is read with predictions=")
-    if settings.checkpoint is None:
+    if (file := settings.checkpoint) is None:
         expected = "a network, or predictions=<folder>"
         raise SettingError("checkpoint", found="null", expected=expected)
-    loaded = load_network(settings.checkpoint, settings.trust)
+    loaded = load_network(file, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])
     loaded.check_predicts(head.kind, remedy)
@@ -48,7 +48,7 @@ def evaluate(settings: EvaluateSettings) -> None:
         loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped.description}."]
     if loaded.class_names != tuple(data.class_names):
         raise SettingError(
-            f"data, for {settings.checkpoint}",
+            f"data, for {file}",
             found=f"classes {listed(data.class_names)}",
             expected=f"{listed(loaded.class_names)}, which the network was trained with",
             remedy="Map classes with label_map=.",
@@ -59,7 +59,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
     rank_zero_only(run.write_settings)()
-    run.test(run.trainer(), settings.checkpoint)
+    run.test(run.trainer(), file)
 
 
 @rank_zero_only
