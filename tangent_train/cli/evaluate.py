@@ -33,10 +33,11 @@ def evaluate(settings: EvaluateSettings) -> None:
         score_files(settings, folder)
         return
     refuse_typed(OF_FILES, "nothing: it is read with predictions=")
-    if (file := settings.checkpoint) is None:
+    checkpoint = settings.checkpoint
+    if checkpoint is None:
         expected = "a network, or predictions=<folder>"
         raise SettingError("checkpoint", found="null", expected=expected)
-    loaded = load_network(file, settings.trust)
+    loaded = load_network(checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])
     loaded.check_predicts(head.kind, remedy)
@@ -48,7 +49,7 @@ def evaluate(settings: EvaluateSettings) -> None:
         loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped.description}."]
     if loaded.class_names != tuple(data.class_names):
         raise SettingError(
-            f"data, for {file}",
+            f"data, for {settings.checkpoint}",
             found=f"classes {listed(data.class_names)}",
             expected=f"{listed(loaded.class_names)}, which the network was trained with",
             remedy="Map classes with label_map=.",
@@ -59,7 +60,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
     rank_zero_only(run.write_settings)()
-    run.test(run.trainer(), file)
+    run.test(run.trainer(), checkpoint)
 
 
 @rank_zero_only
