@@ -19,6 +19,7 @@ from datamodules.synthrooms.datamodule import RoomSettings, generate_rooms
 from studies.output import Row, save
 from tangent_train.geometry import TangentGrid, lonlat_to_equirect
 from tangent_train.inference.views import images_of_side, wide_levels
+from tangent_train.io.palette import UNKNOWN_COLOR
 from tangent_train.rendering import equirect_to_tangent
 from tangent_train.results.chart import COLORS
 
@@ -48,7 +49,7 @@ def wide_views() -> list[Row]:
 
 
 def room(height: int = 512) -> NDArray[np.uint8]:
-    """Return an RGB panorama of a synthetic room, ``(height, 2 height, 3)``.
+    """Return an RGB panorama of a synthetic room, ``(height, 2 height, 3)``, gray at the poles.
 
     Args:
         height: Rows.
@@ -58,6 +59,7 @@ def room(height: int = 512) -> NDArray[np.uint8]:
         generate_rooms(Path(folder), settings, workers=1)
         path = next(Path(folder).rglob("*_rgb.png"))
         image: Any = cv2.imread(str(path))
+    image[~image.any(axis=-1)] = UNKNOWN_COLOR  # where the camera does not see
     return np.ascontiguousarray(image[..., ::-1])
 
 

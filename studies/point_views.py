@@ -1,12 +1,14 @@
 """Points of a panorama from three sides, for one or more depth images of it.
 
 ``python -m studies.point_views points.jpg room.png true_depth.png depth.png`` draws a row for
-each depth image: the floor plan, and the halves of the room ahead and to the left.
+each depth image: the floor plan, and the halves of the room ahead and to the left. ``--titles``
+are the titles of the rows, by default the names of the files.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +51,24 @@ def drawn(
     return np.hstack(views)
 
 
+def titled(rows: Mapping[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Put rows of views below each other, with their titles.
+
+    Args:
+        rows: Views side by side, see `drawn`, by title.
+    """
+    font, black = cv2.FONT_HERSHEY_SIMPLEX, (0, 0, 0)
+    parts = []
+    for title, row in rows.items():
+        strip = np.full((56, row.shape[1], 3), 255, np.uint8)
+        cv2.putText(strip, title, (6, 20), font, 0.6, black, 1, cv2.LINE_AA)
+        for k, name in enumerate(("floor plan", "ahead", "to the left")):
+            cv2.putText(strip, name, (6 + k * SIDE, 48), font, 0.45, black, 1, cv2.LINE_AA)
+        filled = np.flatnonzero((row < 255).any(axis=(1, 2)))
+        parts += [strip, row[filled[0] : filled[-1] + 1], np.full_like(strip[:16], 255)]
+    return np.vstack(parts)
+
+
 def main() -> None:
     """Read the files and write the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -56,6 +76,7 @@ def main() -> None:
     parser.add_argument("panorama", metavar="<panorama>")
     parser.add_argument("depth", type=Path, nargs="+", metavar="<depth>")
     parser.add_argument("--depth_scale", type=float, default=1000, help="units per meter")
+    parser.add_argument("--titles", nargs="+", help="of the rows")
     arguments = parser.parse_args()
     bgr: Any = cv2.imread(arguments.panorama)
     rgb = bgr[..., ::-1]
@@ -64,7 +85,9 @@ def main() -> None:
     clouds = [rays * np.where(depth > 0, depth, np.nan)[..., None] for depth in depths]
     half_m = 1.05 * float(np.nanpercentile(np.abs(clouds[0]), 99.9))
     rows = [drawn(cloud.reshape(-1, 3), rgb.reshape(-1, 3), half_m) for cloud in clouds]
-    cv2.imwrite(arguments.output, np.vstack(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+    titles = arguments.titles or [path.stem for path in arguments.depth]
+    picture = titled(dict(zip(titles, rows, strict=True)))
+    cv2.imwrite(arguments.output, picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from datamodules.zind.layout import CLASSES, DOOR
 def write_strips(root: Path, output: Path) -> None:
     """Write a data set for `data=folder` of the 400 of 1024 rows around the horizon.
 
-    Doors are unknown.
+    Doors are unknown. All but the first panorama are test panoramas.
 
     Args:
         root: Folder with a folder for every home.
@@ -39,7 +39,7 @@ def write_strips(root: Path, output: Path) -> None:
             names.append(panorama.name.replace("/", "_"))
             cv2.imwrite(str(output / "images" / f"{names[-1]}.png"), image[rows])
             cv2.imwrite(str(output / "labels" / f"{names[-1]}.png"), labels[rows])
-    (output / "test.txt").write_text("\n".join(names))
+    (output / "test.txt").write_text("\n".join(names[1:]))  # a data set needs one for training
 
 
 if __name__ == "__main__":

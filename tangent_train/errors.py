@@ -10,8 +10,8 @@ from itertools import takewhile
 from numbers import Integral
 from typing import Any
 
-_LONGEST = 400
-"""Largest number of characters of the value found, which may come from a file."""
+_LONGEST = 450
+"""Largest number of characters of the values found and expected, which may come from a file."""
 
 _CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
 """Characters that terminals interpret as commands."""
@@ -138,9 +138,9 @@ class _ExplainedError(ValueError):
         message = finding = str(subject)
         if found is not None:
             # For an OSError, only its reason: the path is the subject.
-            shown = getattr(found, "strerror", None) or str(found)
-            shown = shown if len(shown) <= _LONGEST else shown[:_LONGEST] + "…"
-            finding = f"{shown}; expected {expected}"
+            texts = (str(t) for t in (getattr(found, "strerror", None) or found, expected))
+            shown = [text if len(text) <= _LONGEST else text[:_LONGEST] + "…" for text in texts]
+            finding = "; expected ".join(shown)
             message = f"{subject}: found {finding}. {remedy}".rstrip()
         super().__init__(printable(message))
         self.finding = printable(finding)

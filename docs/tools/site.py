@@ -28,7 +28,7 @@ OUTER_FILES = {
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\((?!\w+:|#)([^()\s#]+)(#[^()\s]*)?\)")
 _CODE = re.compile(r"(^ *```.*?^ *```$|`[^`\n]+`)", re.DOTALL | re.MULTILINE)
 _FORMULAS = (
-    (re.compile(r"(?<=\w)\^(?:\(([^()]*)\)|(\w+))"), r"<sup>\1\2</sup>"),
+    (re.compile(r"(?<=[\w)])\^(?:\(([^()]*)\)|(\w+))"), r"<sup>\1\2</sup>"),
     (re.compile(r"√\(((?:[^()]|\([^()]*\))*)\)"), r"<math><msqrt><mtext>\1</mtext></msqrt></math>"),
     (re.compile(r"\bR_v\("), "R<sub>v</sub>("),
 )

@@ -32,16 +32,11 @@ class Pictures(Callback):
         folder: Output folder of the pictures of test images.
         test: Number of test images.
         validation: Number of validation images, of the first process.
-
-    Attributes:
-        images: Compressed test images for the report; after the test those of all processes, the
-            worst first.
     """
 
     def __init__(self, folder: Path | str, test: int = 6, validation: int = 4) -> None:
         self.folder = Path(folder)
         self.test, self.validation = test, validation
-        self.images: list[EncodedImage] = []
         self._encoded: dict[int, tuple[float, EncodedImage]] = {}  # with minus the errors
 
     def on_validation_batch_end(  # noqa: D102 - a hook of Lightning
@@ -78,26 +73,40 @@ class Pictures(Callback):
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
-        source = _dataset(trainer, "test")
-        chosen = evenly_spread(self.test, len(source))
         confidences = getattr(pl_module, "confidences", None) or [None] * len(outputs)
-        results = zip(batch.index.tolist(), confidences, batch.labels, outputs, strict=True)
-        for index, confidence, *labels in results:
-            name = source.name(index)
-            image = source.read(index) if index in chosen else None
-            panel = None if image is None else _panel(pl_module, image, *labels)
-            if panel is not None:
-                file = f"{index}_{name.replace('/', '_')}.png"  # unique, by the index
-                write_pixels(self.folder / file, panel)
-                self._encoded[index] = _encoded(pl_module, name, image, confidence, *labels)
+        for result in zip(batch.index.tolist(), confidences, batch.labels, outputs, strict=True):
+            self.draw(pl_module, _dataset(trainer, "test"), *result)
+
+    def draw(self, task: Any, source: Any, index: int, confidence: Any, *labels: Any) -> None:
+        """Draw a test image, if it is one of the chosen ones.
+
+        Args:
+            task: Task with the head and the representation.
+            source: Samples of the test split.
+            index: Place of the image.
+            confidence: Its confidences, or None.
+            *labels: Its true labels and its prediction, see `Task.evaluate`.
+        """
+        name = source.name(index)
+        is_chosen = index in evenly_spread(self.test, len(source))
+        image = source.read(index) if is_chosen else None
+        panel = None if image is None else _panel(task, image, *labels)
+        if panel is not None:
+            file = f"{index}_{name.replace('/', '_')}.png"  # unique, by the index
+            write_pixels(self.folder / file, panel)
+            self._encoded[index] = _encoded(task, name, image, confidence, *labels)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the images of all processes."""
-        parts = [self._encoded] * trainer.world_size
         if trainer.world_size > 1:
+            parts = [self._encoded] * trainer.world_size
             torch.distributed.all_gather_object(parts, self._encoded)
-        gathered = {index: entry for part in parts for index, entry in part.items()}
-        self.images = [image for _, image in sorted(gathered.values())]
+            self._encoded = {index: entry for part in parts for index, entry in part.items()}
+
+    @property
+    def images(self) -> list[EncodedImage]:
+        """Compressed test images, the worst first; after the test those of all processes."""
+        return [image for _, image in sorted(self._encoded.values())]
 
 
 def _panel(

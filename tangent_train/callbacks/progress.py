@@ -32,12 +32,9 @@ class ProgressBar(RichProgressBar):
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """Return the metrics that are printed after the bar; older scores name their epoch."""
         metrics = super().get_metrics(trainer, pl_module)
-        is_old, epoch = self._validated <= trainer.current_epoch, f" (epoch {self._validated})"
-        return {
-            name + epoch * (is_old and name.startswith("val/")): value
-            for name, value in metrics.items()
-            if name != "v_num"
-        }
+        old = f" (epoch {self._validated})" * (self._validated <= trainer.current_epoch)
+        ends = {name: old if name.startswith("val/") else "" for name in metrics if name != "v_num"}
+        return {name + end: metrics[name] for name, end in ends.items()}
 
     def on_train_start(self, *args: Any) -> None:
         """Start to time the epochs."""

@@ -13,7 +13,8 @@ from lightning.pytorch.utilities import rank_zero_only
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
-from tangent_train.config.settings import EvaluateSettings
+from tangent_train.cli.scored_files import OF_FILES, score_files
+from tangent_train.config.settings import EvaluateSettings, refuse_typed
 from tangent_train.errors import SettingError, listed
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
@@ -28,7 +29,15 @@ def evaluate(settings: EvaluateSettings) -> None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     _refuse_folder_of_run(folder)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
-    loaded = load_network(settings.checkpoint, settings.trust)
+    if settings.predictions is not None:
+        score_files(settings, folder)
+        return
+    refuse_typed(OF_FILES, "nothing: it is read with predictions=")
+    checkpoint = settings.checkpoint
+    if checkpoint is None:
+        expected = "a network, or predictions=<folder>"
+        raise SettingError("checkpoint", found="null", expected=expected)
+    loaded = load_network(checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])
     loaded.check_predicts(head.kind, remedy)
@@ -51,7 +60,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
     rank_zero_only(run.write_settings)()
-    run.test(run.trainer(), settings.checkpoint)
+    run.test(run.trainer(), checkpoint)
 
 
 @rank_zero_only

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +14,6 @@ from tangent_train.manifest import check_continues
 
 _STORED_OTHERWISE = ("checkpoint", "level", "write")
 """Settings of which a manifest holds a digest, or values that replace null."""
-
-
-def _check_root(name: str, section: Mapping[str, Any]) -> None:
-    """Refuse a missing folder of a data set of this package that is not generated."""
-    target, root = str(section.get("_target_")), section.get("root")
-    is_generated = not {"rooms", "shapes"}.isdisjoint(section)
-    if target.startswith("datamodules.") and not is_generated and not Path(str(root)).is_dir():
-        expected = option_comments(config_folder()).get((target, "root"), "folder")
-        raise SettingError(
-            f"{name}.root", found=f"{root}, no such folder", expected=f"a {expected}"
-        )
 
 
 def check_paths(settings: Settings) -> None:
@@ -42,9 +30,12 @@ def check_paths(settings: Settings) -> None:
     label_map = values.get("label_map")
     if label_map is not None and not label_map_file(label_map).exists():
         raise SettingError("label_map", found=label_map, expected="an existing file")
-    photos = dict(values.get("photos") or {})
-    for name, section in (("data", values.get("data")), ("photos.data", photos.get("data"))):
-        _check_root(name, section or {})
+    data = values.get("data") or {}
+    target, root = str(data.get("_target_")), Path(str(data.get("root")))
+    is_generated = not {"rooms", "shapes"}.isdisjoint(data)
+    if target.startswith("datamodules.") and not is_generated and not root.is_dir():
+        expected = f"a {option_comments(config_folder()).get((target, 'root'), 'folder')}"
+        raise SettingError("data.root", found=f"{root}, no such folder", expected=expected)
     if isinstance(settings, PredictSettings | RenderSettings) and values["input"] is not None:
         input_paths(values["input"])
     for path in filter(None, (output, values.get("figure"))):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,7 @@ class Run:
         task: Task.
         loaded: Network from a file; None if the network is built from the settings.
         notes: Notes on the label map of that network.
+        facts: Further facts of the protocol.
     """
 
     folder: Path
@@ -79,6 +80,7 @@ class Run:
     task: Any
     loaded: LoadedNetwork | None = None
     notes: Sequence[str] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     def trainer(self, callbacks: Sequence[Callback] = ()) -> lightning.Trainer:
         """Build the trainer of the config, with further callbacks, and log the settings."""
@@ -139,7 +141,7 @@ class Run:
             for place, index in enumerate(gathered_order(tested, trainer.world_size)):
                 for group in data.groups(items[index]):
                     groups[group].append(place)
-            self._report(checkpoint, groups, trainer.callbacks)  # type: ignore[attr-defined]
+            self.report(checkpoint, groups, trainer.callbacks)  # type: ignore[attr-defined]
             return
         text = f"{tested} of {len(items)} test {data.noun} were evaluated: no results are written."
         rank_zero_only(print_text)(text)
@@ -168,7 +170,7 @@ class Run:
         )
 
     @rank_zero_only
-    def _report(
+    def report(
         self, checkpoint: Path, groups: Mapping[str, list[int]], callbacks: Sequence[Callback]
     ) -> None:
         """Write the results, with the scores of each group of images (`DataModule.groups`)."""
@@ -183,17 +185,18 @@ class Run:
                 | evaluation.plain_scores(head.scores_of(task.result, places))
                 for group, places in sorted(groups.items())
             ],
-            protocol={**data.facts, **head.facts},
+            protocol={**data.facts, **head.facts, **self.facts},
             checkpoint=name,
             label_map=self.settings.model_dump(mode="json").get("label_map"),
             folds=data.folds,
             settings=evaluation.flat_settings(self.settings.model_dump(mode="json")),
         )
-        notes, tables = [f"Checkpoint: {name}", *self.notes], evaluation.result_tables(result)
+        source = "Checkpoint" if task.network is not None else "Predictions"
+        notes, tables = [f"{source}: {name}", *self.notes], evaluation.result_tables(result)
         summary, (rows, sources) = evaluation.summary_lines(result), published_rows([result])
         published = [published_table(rows, result)] if rows else []
         evaluation.write_results(result, self.folder, [*notes, *sources], published)
-        network = type(self.as_loaded().module).__name__
+        network = source if task.network is None else type(self.as_loaded().module).__name__
         images = [i for c in callbacks if isinstance(c, Pictures) for i in c.images]
         shown = [f"Shown: {len(images)} of {result.images} {data.noun}, the worst first."]
         write_report(

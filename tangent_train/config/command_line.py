@@ -20,7 +20,6 @@ from omegaconf.errors import InterpolationResolutionError
 from tangent_train.config.help import command_settings
 from tangent_train.config.settings import (
     SETTINGS,
-    RunSettings,
     config_name,
     dotted_names,
     is_within,
@@ -159,8 +158,7 @@ def _known(command: str, config: Any) -> list[str]:
     """Return the names of groups and settings that a command reads."""
     kind = SETTINGS[command]
     names = {*dotted_names(OmegaConf.to_container(config, resolve=False))}
-    if issubclass(kind, RunSettings):
-        names |= {path.name for path in config_folder().iterdir() if path.is_dir()}
+    names |= {setting.name for setting in command_settings(command)}
     known = [name for name in sorted(names) if not is_within(name, (*kind.not_read, "hydra"))]
     is_run = "hydra" in config and config.hydra.run.dir != "."
     return [*known, *["hydra.run.dir"] * is_run]

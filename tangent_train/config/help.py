@@ -23,7 +23,6 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """The loader in C, which takes a tenth of the time, where PyYAML has it."""
 
 _BASE = re.compile(r"^  - (?:/(\w+)@(\w+): )?(?!_self_)(\w+)$", re.MULTILINE)
-_HEADING = re.compile(r"^class (\w+)|^    # --- (.*) ---$|^    (\w+): ", re.MULTILINE)
 _GENERAL = {
     "_target_": "Python class or function",
     "_partial_": "true: the run adds further arguments",
@@ -71,14 +70,13 @@ def annotate(text: str, command: str) -> str:
     head, title, printed = re.split(r"^(== Settings.*\n)", text, flags=re.MULTILINE)
     values, comments = yaml.safe_load(printed), option_comments(config_folder())
     comments |= {("", s.name): s.comment for s in command_settings(command)}
-    headings = _headings(SETTINGS[command])
-    groups: dict[str, list[str]] = {h: [] for h in ("required", *headings.values(), "other")}
-    # Sections last: they would separate the other settings of a group.
-    for name in sorted(values, key=lambda name: isinstance(values[name], dict)):
-        is_given = values[name] != "???"
-        groups[headings.get(name, "other") if is_given else "required"].append(name)
+    required = {name: "required" for name, value in values.items() if value == "???"}
+    headings = _headings(SETTINGS[command]) | required
     lines = [line for text in head.splitlines() for line in _wrapped(text, "    ")] + [title[:-1]]
-    for heading, names in groups.items():
+    for heading in dict.fromkeys(("required", *headings.values(), "other")):
+        names = [name for name in values if headings.get(name, "other") == heading]
+        # Sections last: they would separate the other settings.
+        names.sort(key=lambda name: isinstance(values[name], dict))
         lines += [f"\n# --- {heading} ---"] * bool(names)
         lines += _explain({name: values[name] for name in names}, comments, (), ())
     return "\n".join([*lines, ""])
@@ -115,16 +113,13 @@ def _declared(kind: type[Settings], prefix: str) -> Iterator[Setting]:
 
 def _headings(kind: type[Settings]) -> dict[str, str]:
     """Return the headings above the settings of a class and its bases, from their source."""
-    of_classes: dict[str, dict[str, str]] = {}
-    for owner, title, name in _HEADING.findall(Path(inspect.getfile(Settings)).read_text("utf-8")):
-        if owner:
-            found, heading = of_classes.setdefault(owner, {}), ""
-        elif title:
-            heading = title
-        elif heading:
-            found[name] = heading
-    bases_first = reversed(kind.__mro__)
-    return {n: h for base in bases_first for n, h in of_classes.get(base.__name__, {}).items()}
+    source, found = Path(inspect.getfile(kind)).read_text("utf-8"), dict[str, str]()
+    for base in reversed(kind.__mro__):
+        body = source.partition(f"class {base.__name__}(")[2].partition("\n\n\n")[0]
+        for part in body.split("    # --- ")[1:]:
+            heading, _, fields = part.partition(" ---\n")
+            found |= dict.fromkeys(re.findall(r"^    (\w+): ", fields, re.MULTILINE), heading)
+    return found
 
 
 def read_settings(file: Path) -> list[Setting]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
@@ -338,20 +338,18 @@ class ImportSettings(Settings):
     overwrite: bool = False
     """true: replace an existing file"""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _check_source(cls, values: dict[str, Any]) -> dict[str, Any]:
+    @model_validator(mode="after")
+    def _check_source(self) -> Self:
         """Refuse settings that name no trained network."""
-        is_own = values.get("network") is not None
-        if values.get("library") is None and not (is_own and values.get("weights")):
+        if self.library is None and None in (self.network, self.weights):
+            expected = "library=torchvision, huggingface, smp or onnx; or network= with weights="
             raise SettingError(
-                "weights" if is_own else "library",
+                "library" if self.network is None else "weights",
                 found="null",
-                expected="a trained network: library=torchvision, huggingface, smp or onnx; or "
-                "network= with weights=<its file>",
+                expected=f"a trained network: {expected}<its file>",
                 remedy=f"Example: {_example('import')}",
             )
-        return values
+        return self
 
 
 class KeypointSettings(Settings):
@@ -480,6 +478,29 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
         "trainer.(overfit|reload|sync|val)_.*",
     )
 
+    checkpoint: ExistingPath | None = None  # type: ignore[assignment]
+    """network file, written by tangent-train, tangent-import or tangent-export; required without
+    predictions="""
+
+    # --- predictions of any program ---
+    predictions: ExistingPath | None = None
+    """folder of predictions of any program, which are scored instead of a network: label maps,
+    class scores or distances of panoramas, named as the images"""
+    values: str | None = None
+    """predictions: values of the classes in label maps: from_1 (0 is unknown) | from_0 | ids (those
+    of the data set's own files) | a JSON file as classes.json, also with colors; null = by
+    classes.json in the folder, else from_1"""
+    files: ExistingPath | None = None
+    """predictions: CSV file with the columns image and prediction; null = by the names of files"""
+    resample: Literal["nearest", "linear"] | None = None
+    """predictions: brings other sizes to that of the labels: nearest | linear (distances); null =
+    other sizes are not scored"""
+    depth_scale: PositiveFloat = 1000
+    """predictions: units per meter in depth files of integers"""
+    depth_channel: str | None = None
+    """predictions: channel of OpenEXR files; null = as tangent-predict"""
+
+    # --- views ---
     representation: Section | None = None  # type: ignore[assignment]
     """views of a panorama that the network receives; null = as in the checkpoint"""
     level: Level | None = None  # type: ignore[assignment]

@@ -28,9 +28,11 @@ from tangent_train.metrics.scores import (
     ScoreColumn,
     bootstrap,
     by_solid_angle,
+    sphere_columns,
     with_solid_angle,
 )
 from tangent_train.metrics.segmentation import AbsentClass, SegmentationCounts
+from tangent_train.metrics.sphere import seam_step
 from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import ScoreMosaic
 
@@ -62,7 +64,10 @@ class ClassesHead(Head):
             "macc": ScoreColumn("mAcc", "%", "accuracy", "accuracy"),
             "miou": ScoreColumn("mIoU", "%", "iou", "IoU"),
         }
-    )
+    ) | {
+        "boundary_miou": ScoreColumn("mIoU near boundaries", is_main=False, of_sphere=True),
+        **sphere_columns("mIoU"),
+    }
     main_score: ClassVar[str] = "miou"
     predict_settings = MappingProxyType({"min_confidence": "", "min_share": "min_confidence"})
     summary: ClassVar[str] = "classes"
@@ -162,8 +167,10 @@ class ClassesHead(Head):
             for band in result.bands
         ]
         of_classes = self._both(*given, lambda counts: score(counts).of_classes)
+        of_sphere = self._sphere_scores(result.regions.sum(axis=0), result.seam.sum(axis=0))
         return Scores(
-            self._both(*given, lambda counts: score(counts).means),
+            self._both(*given, lambda counts: score(counts).means)
+            | {name: float(value) for name, value in of_sphere.items() if len(result.seam)},
             of_classes | {"share": score(result.pixels).share},
             bands if result.solid_angle.any() else (),
             result.pixels,
@@ -173,7 +180,24 @@ class ClassesHead(Head):
         """Return intervals of the means."""
         score = partial(segmentation.mean_scores, absent_class=self.absent_class)
         pixels, angles = result.of_images.swapaxes(0, 1)
-        return self._both(pixels, angles, lambda images: bootstrap(images, score))
+        found = self._both(pixels, angles, lambda images: bootstrap(images, score))
+        if not len(result.seam):
+            return found
+        parts = result.regions.reshape(len(result.seam), -1), result.seam
+        split = parts[0].shape[1]
+
+        def of_sphere(sums: NDArray[np.float64]) -> dict[str, Any]:
+            regions = sums[:, :split].reshape(-1, *result.regions.shape[1:])
+            return self._sphere_scores(regions, sums[:, split:])
+
+        return found | bootstrap(np.concatenate(parts, axis=1), of_sphere)
+
+    def _sphere_scores(self, regions: NDArray[Any], seam: NDArray[Any]) -> dict[str, Any]:
+        """Return the scores that only panoramas have, see `SegmentationCounts`."""
+        scores = segmentation.mean_scores(regions, self.absent_class)["miou"]
+        poles, horizon, near, others, boundaries = np.moveaxis(scores, -1, 0)
+        gaps = {"pole_gap": poles - horizon, "seam_gap": near - others}
+        return {"boundary_miou": boundaries, **gaps, "seam_step": seam_step(seam)}
 
     def scores_of(self, result: SegmentationCounts, places: Sequence[int]) -> dict[str, float]:
         """Return mIoU and mAcc, of panoramas also by solid angle."""

@@ -27,7 +27,14 @@ from tangent_train.heads.classes import exact
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
 from tangent_train.kinds import Align, DepthKind
 from tangent_train.metrics import depth as metrics
-from tangent_train.metrics.scores import Interval, ScoreColumn, by_solid_angle, with_solid_angle
+from tangent_train.metrics.scores import (
+    Interval,
+    ScoreColumn,
+    by_solid_angle,
+    defined_mean,
+    sphere_columns,
+    with_solid_angle,
+)
 from tangent_train.rendering import Blend
 
 if TYPE_CHECKING:
@@ -97,7 +104,7 @@ class DistanceHead(Head):
             "delta3": ScoreColumn("δ3", is_main=False),
             "missing": ScoreColumn("missing", better="lower", is_main=False),
         }
-    )
+    ) | sphere_columns("AbsRel", "", better="lower")
     main_score: ClassVar[str] = "absrel"
     predict_settings = MappingProxyType(
         {"align": "", "depth_format": "depth", "depth_scale": "depth", "points": "points"}
@@ -195,21 +202,24 @@ class DistanceHead(Head):
         return DepthMetric()
 
     def scores(self, result: NDArray[np.float64]) -> Scores:
-        """Return means over images; for panoramas, also by solid angle and latitude.
+        """Return means over images; for panoramas, also by solid angle, latitude and region.
 
         Args:
-            result: Sums ``(images, 8, 10)``, see `error_sums`.
+            result: Sums ``(images, 13, 10)``, see `error_sums`.
         """
         pixels, angles = (metrics.mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
         if not result[:, 1].any():
             return Scores(pixels)
-        bands = map(metrics.mean_depth_scores, result[:, 2:].swapaxes(0, 1))
-        return Scores(pixels | by_solid_angle(angles), bands=list(bands))
+        bands = map(metrics.mean_depth_scores, result[:, metrics.BANDS].swapaxes(0, 1))
+        of_sphere = metrics.sphere_scores(result[:, metrics.SPHERE])
+        means = {name: float(defined_mean(values)) for name, values in of_sphere.items()}
+        return Scores(pixels | by_solid_angle(angles) | means, bands=list(bands))
 
     def intervals(self, result: NDArray[np.float64]) -> dict[str, Interval]:
         """Return intervals of the means."""
-        pixels, angles = (metrics.depth_intervals(result[:, weighting]) for weighting in (0, 1))
-        return pixels | by_solid_angle(angles)
+        pixels, angles = (metrics.depth_scores(result[:, weighting]) for weighting in (0, 1))
+        of_sphere = metrics.sphere_scores(result[:, metrics.SPHERE])
+        return metrics.depth_intervals(pixels | by_solid_angle(angles) | of_sphere)
 
     def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
         """Return means over some images; NaN if they have no known distances."""

@@ -65,7 +65,7 @@ def mixed_picture(rgb: _Image, labels: NDArray[np.integer], class_names: tuple[s
 
     Args:
         rgb: RGB picture ``(H, W, 3)``.
-        labels: Labels ``(H, W)``; unknown pixels (0) show the picture.
+        labels: Labels ``(H, W)``; unknown pixels (0) show the picture, gray where it is black.
         class_names: Names of the K + 1 labels.
     """
     light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
@@ -75,6 +75,7 @@ def mixed_picture(rgb: _Image, labels: NDArray[np.integer], class_names: tuple[s
         is_border = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
         mixed[is_border] = colors[is_border]
     mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
+    mixed[(labels == UNKNOWN) & ~rgb.any(axis=-1)] = UNKNOWN_COLOR
     return mixed
 
 
@@ -238,8 +239,7 @@ def shown_arrays(
         (crops,) = image.sampler(representation).view_sets()
         rgb, truth, labels = map(np.hstack, (crops.render(rgb, "bilinear"), truth, labels))
     valid = image.valid if target.ndim == 2 else None
-    is_seen = rgb.any(axis=-1) | (truth > 0)
-    is_seen &= True if valid is None else valid
+    is_seen = (rgb.any(axis=-1) | (truth > 0)) & (True if valid is None else valid)
     rgb = np.where(is_seen[..., None], rgb, UNKNOWN_COLOR)
     truth, labels = (np.where(is_seen, m, m.dtype.type(unknown)) for m in (truth, labels))
     if cut and valid is not None:

@@ -20,6 +20,7 @@ from dataclasses import replace
 from functools import partial
 from numbers import Real
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
 
 import numpy as np
@@ -39,14 +40,7 @@ from datamodules.core.label_map import (
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.config.build import checks_types
-from tangent_train.errors import (
-    SettingError,
-    at_least,
-    check_choice,
-    check_type,
-    listed,
-    width_height,
-)
+from tangent_train.errors import SettingError, at_least, check_choice, check_type, width_height
 from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
@@ -532,8 +526,8 @@ def map_classes(
     if foreign or len(rest) == len(names):
         raise SettingError(
             "label_map",
-            found=f"target classes {listed(label_map.names)}",
-            expected=f"a map from {listed(names)} to {listed(targets)}",
+            found=f"target classes {', '.join(label_map.names)}",
+            expected=f"a map from {', '.join(names)} to {', '.join(targets)}",
         )
     check_choice("unmapped", unmapped, ("unknown", "never"))
     if rest and loaded.score_kind == "labels":
@@ -557,7 +551,7 @@ def map_classes(
         "not in the network": [name for name in target_of if name not in known],
         "unknown where they win" if unmapped == "unknown" else "never win": rest,
     }
-    parts = [f"{target} ← {listed(of)}" for target, of in classes.items() if of]
-    parts += [f"{text}: {listed(of)}" for text, of in described.items() if of]
+    parts = [f"{target} ← {', '.join(of)}" for target, of in classes.items() if of]
+    parts += [f"{text}: {', '.join(of)}" for text, of in described.items() if of]
     changed = replace(loaded, class_names=("unknown", *targets), groups=tuple(given))
-    return MappedNetwork(changed, classes, "; ".join(parts))
+    return MappedNetwork(changed, classes, shorten("; ".join(parts), 600, placeholder=" …"))

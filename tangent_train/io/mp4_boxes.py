@@ -32,7 +32,7 @@ class SphericalBoxes(NamedTuple):
     Attributes:
         mode: Stereo mode by the names of `StereoMode`, or its number; None without a box ``st3d``.
         projection: Name of a projection that FFmpeg does not read, such as ``mshp``, a mesh; or "".
-        xml: XML of V1; empty if there is none, or V2.
+        xml: XML of V1; empty without V1, or beside V2.
     """
 
     mode: str | None = None
@@ -41,7 +41,7 @@ class SphericalBoxes(NamedTuple):
 
 
 def spherical_boxes(path: Path) -> SphericalBoxes:
-    """Read the boxes of an MP4 file; others have none."""
+    """Read the boxes of an MP4 file; nothing is stated by other files."""
     found, is_v2 = SphericalBoxes(), False
     for parent, name, content in _boxes(_moov(path), b"moov"):
         is_v2 |= name == b"sv3d"

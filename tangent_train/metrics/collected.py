@@ -15,33 +15,36 @@ from torchmetrics import Metric
 from torchmetrics.classification import MulticlassConfusionMatrix
 from torchmetrics.utilities import dim_zero_cat
 
-from tangent_train.metrics.depth import SUMS, error_sums
+from tangent_train.metrics.depth import SUMS, WEIGHTINGS, error_sums
 from tangent_train.metrics.scores import BAND_EDGES_DEG
 from tangent_train.metrics.segmentation import SegmentationCounts, count_image
+from tangent_train.metrics.sphere import REGIONS, SEAM_SUMS
 
 
 class ImagesMetric(Metric):
     """Collects numbers of each image of a data set, on all processes.
 
     Args:
-        *shape: Shape of the numbers of an image.
+        **shapes: Shape of the numbers of an image, by the name of the state.
     """
 
     full_state_update = False
     of_images: list[Tensor]
 
-    def __init__(self, *shape: int) -> None:
+    def __init__(self, **shapes: tuple[int, ...]) -> None:
         super().__init__()
-        self._shape = shape
-        self.add_state("of_images", [], dist_reduce_fx="cat")
+        self._shapes = shapes
+        for name in shapes:
+            self.add_state(name, [], dist_reduce_fx="cat")
         self.reset()
 
     def reset(self) -> None:
         """Forget all images."""
         super().reset()
         # Processes without images contribute an empty part of the same dtype and shape.
-        empty = torch.zeros((0, *self._shape), dtype=torch.float64, device=self.device)
-        self.of_images = [empty]
+        for name, shape in self._shapes.items():
+            empty = torch.zeros((0, *shape), dtype=torch.float64, device=self.device)
+            setattr(self, name, [empty])
 
 
 class SegmentationMetric(ImagesMetric):
@@ -59,7 +62,9 @@ class SegmentationMetric(ImagesMetric):
     bands: Tensor
 
     def __init__(self, num_classes: int) -> None:
-        super().__init__(2, 3, num_classes - 1)
+        classes = 3, num_classes - 1
+        regions = len(REGIONS) + 1, *classes
+        super().__init__(of_images=(2, *classes), regions=regions, seam=(SEAM_SUMS,))
         self.num_classes = k = num_classes
         integers = {"pixels": (k, k), "bands": (len(BAND_EDGES_DEG) - 1, k, k)}
         for name, shape in integers.items():
@@ -74,7 +79,8 @@ class SegmentationMetric(ImagesMetric):
         counts = count_image(prediction, truth, self.num_classes)
         for name in ("pixels", "solid_angle", "bands"):
             setattr(self, name, getattr(self, name) + getattr(counts, name))
-        self.of_images.append(counts.of_images)
+        for name in self._shapes:
+            getattr(self, name).append(getattr(counts, name))
 
     def compute(self) -> SegmentationCounts:
         """Return the counts of all processes as arrays."""
@@ -95,13 +101,13 @@ class DepthMetric(ImagesMetric):
     """Collects the errors of all images of a data set, see `error_sums`."""
 
     def __init__(self) -> None:
-        super().__init__(1 + len(BAND_EDGES_DEG), SUMS)
+        super().__init__(of_images=(WEIGHTINGS, SUMS))
 
     def update(self, prediction: Tensor, truth: Tensor) -> None:
         """Add the errors of one image, see `error_sums`."""
         self.of_images.append(error_sums(prediction, truth)[None])
 
     def compute(self) -> NDArray[np.float64]:
-        """Return the sums ``(images, 8, 10)`` of all processes."""
+        """Return the sums ``(images, 13, 10)`` of all processes."""
         sums: NDArray[np.float64] = dim_zero_cat(self.of_images).cpu().numpy()
         return sums

@@ -34,6 +34,14 @@ from tangent_train.metrics.scores import (
     bootstrap,
     defined_mean,
 )
+from tangent_train.metrics.sphere import (
+    REGIONS,
+    SEAM_SUMS,
+    beside_seam,
+    row_weights,
+    seam_step,
+    seam_sums,
+)
 
 Alignment = Literal["none", "median", "scale", "affine"]
 """Alignment of a prediction with the true distances of the image: ``median`` and ``scale`` multiply
@@ -46,6 +54,13 @@ Quantity = Literal["distance", "disparity"]
 _ERRORS = ("absrel", "sqrel", "rmse", "rmse_log", "mae")
 _SHARES = ("delta1", "delta2", "delta3")
 SUMS = 2 + len(_ERRORS) + len(_SHARES)
+BANDS = slice(2, 1 + len(BAND_EDGES_DEG))
+SPHERE = slice(BANDS.stop, None)
+WEIGHTINGS = BANDS.stop + len(REGIONS) + 1
+"""Weightings of the sums of an image, see `error_sums`; those of the latitude bands, and those for
+`sphere_scores`."""
+
+_SEAM = BANDS.stop + REGIONS.index("seam")
 _THRESHOLD = 1.25
 
 
@@ -159,8 +174,9 @@ def error_sums(
         truth: True distances in meters; NaN where unknown.
 
     Returns:
-        ``(8, 10)`` float64 sums by weighting: pixels, solid angles, and pixels of the latitude
-        bands `BAND_EDGES_DEG`; the last seven are 0 for photos. See `depth_scores`.
+        ``(13, 10)`` float64 sums by weighting: pixels, solid angles, pixels of the latitude bands
+        `BAND_EDGES_DEG`, solid angles of `REGIONS`, and `seam_sums` at the end; all but the first
+        are 0 for photos. See `depth_scores`.
     """
     known = truth > 0  # False for NaN
     predicted = known & (prediction > 0) & prediction.isfinite()
@@ -168,17 +184,30 @@ def error_sums(
     away, ratio = (d - g).abs(), torch.maximum(d / g, g / d)
     values = [known, predicted, away / g, away**2 / g, away**2, (d / g).log() ** 2, away]
     values += [predicted & (ratio < _THRESHOLD**n) for n in (1, 2, 3)]
+    weights = torch.from_numpy(_row_weights(tuple(truth.shape))).to(truth.device)
     rows = torch.stack([value.double().flatten(1).sum(dim=1) for value in values], dim=1)
-    return torch.from_numpy(_row_weights(tuple(truth.shape))).to(rows.device) @ rows
+    sums = torch.zeros((WEIGHTINGS, SUMS), dtype=torch.float64, device=truth.device)
+    sums[: len(weights)] = weights @ rows
+    if truth.ndim == 2:
+        beside = torch.as_tensor(beside_seam(truth.shape[1]), device=truth.device)
+        near = torch.stack([value[:, beside].double().sum(dim=1) for value in values], dim=1)
+        sums[_SEAM] = weights[1] @ near
+        sums[_SEAM + 1] = sums[1] - sums[_SEAM]
+        logs = (torch.where(predicted, x, torch.nan).log() for x in (prediction, truth))
+        steps = [(log - log.roll(-1, 1)).abs().cpu().numpy() for log in logs]
+        at_seam = seam_sums(steps[0], steps[1], ~np.isnan(steps[1]))
+        sums[-1, :SEAM_SUMS] = torch.from_numpy(at_seam).to(truth.device)
+    return sums
 
 
 @lru_cache(maxsize=4)
 def _row_weights(shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return the weights of the rows of a panorama, or of the crops of a photo."""
     if len(shape) != 2:
-        return np.outer(np.arange(1 + len(BAND_EDGES_DEG)) == 0, np.ones(shape[0]))
+        return np.ones((1, shape[0]))
     bands = np.eye(len(BAND_EDGES_DEG) - 1)[:, band_of_rows(shape[0])]
-    return np.stack([np.ones(shape[0]), equirect_solid_angles((shape[0], shape[1])), *bands])
+    angles = equirect_solid_angles((shape[0], shape[1]))
+    return np.stack([np.ones(shape[0]), angles, *bands, *row_weights(shape[0])])
 
 
 def depth_scores(sums: Float[np.ndarray, "*some sums"]) -> dict[str, NDArray[np.float64]]:
@@ -206,13 +235,22 @@ def mean_depth_scores(sums: Float[np.ndarray, "images sums"]) -> dict[str, float
     return {name: float(defined_mean(scores)) for name, scores in depth_scores(sums).items()}
 
 
-def depth_intervals(sums: Float[np.ndarray, "images sums"]) -> dict[str, Interval]:
-    """Return 95 % bootstrap intervals of `mean_depth_scores`, see `bootstrap`.
+def sphere_scores(sums: Float[np.ndarray, "images regions sums"]) -> dict[str, NDArray[np.float64]]:
+    """Compute the scores of panoramas that only panoramas have: gaps of AbsRel, see `REGIONS`.
 
     Args:
-        sums: Sums of each image with one weighting.
+        sums: Sums of each image with the weightings `SPHERE`.
+
+    Returns:
+        Scores by name; NaN where they are undefined.
     """
-    scores = depth_scores(sums)
+    poles, horizon, seam, elsewhere = depth_scores(sums[:, :-1])["absrel"].T
+    steps = seam_step(sums[:, -1, :SEAM_SUMS])
+    return {"pole_gap": poles - horizon, "seam_gap": seam - elsewhere, "seam_step": steps}
+
+
+def depth_intervals(scores: Mapping[str, NDArray[np.float64]]) -> dict[str, Interval]:
+    """Return 95 % bootstrap intervals of the means of scores ``(images,)``, see `bootstrap`."""
     columns = np.stack([*scores.values()], axis=1)
     defined = ~np.isnan(columns)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -29,6 +29,7 @@ class ScoreColumn:
         better: ``higher``, or ``lower`` for errors.
         is_main: True if reports of several runs and headlines contain the score; all scores are in
             the files and in the tables of a run.
+        of_sphere: True for a score that only panoramas have, see `metrics.sphere`.
     """
 
     text: str
@@ -37,6 +38,7 @@ class ScoreColumn:
     class_text: str = ""
     better: str = "higher"
     is_main: bool = True
+    of_sphere: bool = False
 
     @property
     def title(self) -> str:
@@ -69,6 +71,22 @@ def with_solid_angle(columns: Mapping[str, ScoreColumn]) -> dict[str, ScoreColum
         )
         for name, column in columns.items()
     }
+
+
+def sphere_columns(text: str, unit: str = "%", better: str = "higher") -> dict[str, ScoreColumn]:
+    """Return the columns of the scores of panoramas, see `metrics.sphere`.
+
+    Args:
+        text: Name of the score that is compared between regions.
+        unit: Its unit.
+        better: Its better direction.
+    """
+    how: dict[str, Any] = {"is_main": False, "of_sphere": True}
+    gaps = {"pole_gap": "near the poles, minus horizon", "seam_gap": "near the seam, minus others"}
+    columns = {
+        name: ScoreColumn(f"{text} {of}", unit, better=better, **how) for name, of in gaps.items()
+    }
+    return columns | {"seam_step": ScoreColumn("step across the seam", unit, better="lower", **how)}
 
 
 BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)

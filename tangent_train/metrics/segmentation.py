@@ -13,9 +13,21 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.metrics.scores import BAND_EDGES_DEG, band_of_rows, defined_mean
+from tangent_train.metrics.sphere import (
+    REGIONS,
+    SEAM_SUMS,
+    beside_seam,
+    boundary_sums,
+    right,
+    row_weights,
+    seam_sums,
+)
 
 AbsentClass = Literal["skip", "zero"]
 """Treatment of a class without labeled pixels: left out of means, or counted as 0."""
+
+_COUNTS_AT_ONCE = 2**22
+"""Counts of rows of a panorama that are held at once, 32 MiB."""
 
 UNKNOWN = 0
 """Class index of unlabeled pixels in all data sets."""
@@ -92,12 +104,17 @@ class SegmentationCounts(NamedTuple):
         bands: ``(6, K+1, K+1)`` pixels of panoramas in the latitude bands `BAND_EDGES_DEG`.
         of_images: ``(images, 2, 3, K)`` sums from which each image's scores follow, in pixels and
             in steradians: labeled area, predicted area and hits of each class.
+        regions: ``(images, 5, 3, K)`` the same in steradians of the `REGIONS` of panoramas, and
+            near boundaries, see `boundary_sums`; no images if they are photos.
+        seam: ``(images, 6)`` see `seam_sums`.
     """
 
     pixels: Any
     solid_angle: Any
     bands: Any
     of_images: Any
+    regions: Any
+    seam: Any
 
 
 def count_image(
@@ -116,29 +133,60 @@ def count_image(
     Raises:
         SettingError: A class index is out of range.
     """
-    known, k = truth != UNKNOWN, num_classes
-    pairs = _checked(truth[known], k) * k + _checked(prediction[known], k)
-    bands = pairs.new_zeros((len(BAND_EDGES_DEG) - 1, k, k))
-    if truth.ndim == 2:
-        height, width = truth.shape
-        rows = known.nonzero()[:, 0]
-        # Integer counts first, so that results do not depend on the order or the device.
-        by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k)
-        by_row = by_row.reshape(height, k, k)
-        bands.index_add_(0, torch.as_tensor(band_of_rows(height), device=truth.device), by_row)
-        angles = torch.as_tensor(equirect_solid_angles((height, width)), device=truth.device)
-        pixels, steradians = by_row.sum(dim=0), torch.tensordot(angles, by_row.double(), dims=1)
-    else:
-        pixels = torch.bincount(pairs, minlength=k * k).reshape(k, k)
+    k = num_classes
+    pairs = torch.add(_checked(prediction, k), _checked(truth, k), alpha=k)
+    bands = torch.zeros((len(BAND_EDGES_DEG) - 1, k, k), dtype=torch.int64, device=truth.device)
+    if truth.ndim != 2:
+        pixels = _counted(pairs[None], k)[0]
         steradians = torch.zeros_like(pixels, dtype=torch.float64)
+        regions = steradians.new_zeros((0, len(REGIONS) + 1, 3, k - 1))
+        seam = steradians.new_zeros((0, SEAM_SUMS))
+    else:
+        height, width = truth.shape
+        weights = torch.as_tensor(
+            np.stack([equirect_solid_angles((height, width)), *row_weights(height)])
+        ).to(truth.device)
+        band, beside = (
+            torch.as_tensor(places, device=truth.device)
+            for places in (band_of_rows(height), beside_seam(width))
+        )
+        by_angle = weights.new_zeros((len(weights) + 1, k, k))
+        step = max(1, _COUNTS_AT_ONCE // k**2)
+        # Integer counts first, so that results do not depend on the order or the device.
+        for part in (slice(top, top + step) for top in range(0, height, step)):
+            of_rows, of_seam = _counted(pairs[part], k), _counted(pairs[part][:, beside], k)
+            bands.index_add_(0, band[part], of_rows)
+            by_angle[:-1] += torch.tensordot(weights[:, part], of_rows.double(), dims=1)
+            by_angle[-1] += torch.tensordot(weights[0, part], of_seam.double(), dims=1)
+        pixels, (steradians, poles, horizon, seam_zone) = bands.sum(dim=0), by_angle
+        matrices = poles, horizon, seam_zone, steradians - seam_zone
+        maps = [labels.cpu().numpy().astype(np.uint8) for labels in (prediction, truth)]
+        edges = torch.from_numpy(boundary_sums(maps[0], maps[1], k)).to(truth.device)
+        of_regions = [torch.stack(_class_sums(matrix)) for matrix in matrices]
+        regions = torch.stack([*of_regions, edges])[None]
+        known = maps[1] > UNKNOWN
+        changes = [labels != right(labels) for labels in maps]
+        at_seam = seam_sums(changes[0], changes[1], known & right(known))
+        seam = torch.from_numpy(at_seam)[None]
     sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
-    return SegmentationCounts(pixels, steradians, bands, torch.stack(sums)[None])
+    counts = pixels, steradians, bands, torch.stack(sums)[None], regions, seam.to(truth.device)
+    return SegmentationCounts(*counts)
+
+
+def _counted(pairs: Tensor, num_classes: int) -> Tensor:
+    """Count pairs ``(n, …)`` in n matrices; those of unknown pixels are left out."""
+    k, rows = num_classes, torch.arange(len(pairs), device=pairs.device, dtype=torch.int32)
+    flat = (pairs.flatten(1) + (rows * k * k)[:, None]).flatten()
+    counts = torch.bincount(flat, minlength=len(pairs) * k * k).reshape(-1, k, k)
+    counts[:, UNKNOWN] = 0
+    return counts
 
 
 def _checked(indices: Tensor, num_classes: int) -> Tensor:
+    indices = indices.int()
     least, greatest = map(int, indices.aminmax()) if indices.numel() else (0, 0)
     if least < 0 or greatest >= num_classes:
         raise SettingError(
             "class index", found=f"{least} to {greatest}", expected=f"0 to {num_classes - 1}"
         )
-    return indices.long()
+    return indices

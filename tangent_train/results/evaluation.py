@@ -16,7 +16,7 @@ import numpy as np
 import yaml  # type: ignore[import-untyped]
 from pydantic import TypeAdapter
 
-from tangent_train.errors import DataError, counted
+from tangent_train.errors import DataError, counted, listed
 from tangent_train.files import csv_text, read_json, write_text
 from tangent_train.metrics.scores import BAND_EDGES_DEG, SOLID_ANGLE, Interval, ScoreColumn
 from tangent_train.results.tables import Table, markdown_text, score_text
@@ -233,6 +233,13 @@ def result_tables(result: EvaluationResult) -> list[Table]:
         result: The evaluation.
     """
     tables = [_per_class(result) if result.classes else _over_all(result)]
+    of_sphere = [
+        [column.title, _mean(result, name)]
+        for name, column in result.columns.items()
+        if column.of_sphere and result.scores.get(name) is not None
+    ]
+    if of_sphere:
+        tables.append(Table("On the sphere", ("score", f"over all {result.noun}"), of_sphere))
     bands = [
         {"latitude": "{}° … {}°".format(*band["latitude_deg"]), **band}
         for band in result.latitude_bands
@@ -266,7 +273,7 @@ def _over_all(result: EvaluationResult) -> Table:
     rows = [
         [column.title, _mean(result, name)]
         for name, column in result.columns.items()
-        if _is_shown(result, name)
+        if _is_shown(result, name) and not column.of_sphere
     ]
     return Table("Scores", ("score", f"over all {result.noun}"), rows)
 
@@ -275,30 +282,23 @@ def _per_class(result: EvaluationResult) -> Table:
     names = [n for n in result.classes[0] if n != "class" and _is_shown(result, n)]
     columns = {n: result.columns[mean] for n, mean in result.class_means.items()}
     predicted = np.sum(result.confusion, axis=0)[-len(result.classes) :]
-    entries = [
-        entry
-        for entry, count in zip(result.classes, predicted, strict=True)
-        if count or entry[result.main_of_class] is not None
-    ]
     rows = [
         [entry["class"]]
         + [
             str(entry[n]) if n == "images" else score_text(entry[n], getattr(c, "unit", "%"))
             for n, c in zip(names, map(columns.get, names), strict=True)
         ]
-        for entry in entries
+        for entry, count in zip(result.classes, predicted, strict=True)
+        if count or entry[result.main_of_class] is not None
     ]
+    sizes = {entry["class"]: entry.get("share", entry.get("images")) for entry in result.classes}
+    shares = [sizes[row[0]] or 0 for row in rows]
     titles = (columns[n].class_title if n in columns else _COUNTS[n] for n in names)
     means = (_mean(result, result.class_means[n]) if n in columns else "" for n in names)
-    note = f"Means without classes that do not occur in the labels: {', '.join(result.absent)}."
-    return Table(
-        "Per class",
-        ["class", *titles],
-        [*rows, ["mean", *means]],
-        note * bool(result.absent),
-        shares=[entry.get("share", entry.get("images")) or 0 for entry in entries],
-        file=RESULTS_FILE,
-    )
+    rows.append(["mean", *means])
+    note = f"Means without classes that do not occur in the labels: {listed(result.absent)}."
+    note *= bool(result.absent)
+    return Table("Per class", ["class", *titles], rows, note, shares=shares, file=RESULTS_FILE)
 
 
 def confusion_table(result: EvaluationResult) -> Table:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from textwrap import shorten
 from typing import Any
 
 from rich import table as rich_table
@@ -22,9 +21,6 @@ _WIDTH = 100
 
 _MOST_ROWS = 20
 """Printed rows of classes."""
-
-_MOST_NOTE = 600
-"""Printed characters of a note."""
 
 _LONG = 32
 """Number of characters above which a cell may take several lines in HTML."""
@@ -82,8 +78,7 @@ class Table:
             console.width = max(_WIDTH, sum(longest) + 3 * len(columns) + 1)
         if sum(max(map(len, column)) + 3 for column in columns) >= console.width:
             rows = [[cell.replace(" [", "\n[") for cell in row] for row in rows]  # intervals
-        texts = self.title, shorten(self.note, _MOST_NOTE, placeholder=" …")
-        title, note = (_shown(text) if text else None for text in texts)
+        title, note = (_shown(text) if text else None for text in (self.title, self.note))
         table = rich_table.Table(title=title, caption=note, show_lines=self.lines)
         for k, (name, least) in enumerate(zip(self.header, longest, strict=True)):
             justify: Any = "left" if k in self.text_columns else "right"

@@ -93,7 +93,7 @@ def test_an_import_without_a_trained_network_is_explained(here: Path, run: Run) 
     with pytest.raises(
         SystemExit, match=r"weights: .* a trained network.*Example: tangent-import library="
     ):
-        run("import", "network=unet", "network.widths=[4,8]")
+        run("import", "network=unet", "network.widths=[4,8]", "output=net.ckpt")
 
 
 def test_weights_of_another_network_are_one_line(here: Path, run: Run) -> None:

@@ -65,7 +65,10 @@ def test_scores_equal_loops_by_pixels_by_solid_angle_and_in_latitude_bands() -> 
     angles = np.broadcast_to(equirect_solid_angles((12, 24))[:, None], (12, 24))
     # 12 rows of 15°: two rows in each band of 30°.
     weights = [np.ones((12, 24)), angles, *(rows // 2 == band for band in range(6))]
-    for of_weighting, weight in zip(sums, weights, strict=True):
+    beside = np.isin(np.arange(24), [0, 23]) + np.zeros((12, 1))  # 5 % of 24 columns
+    weights += [angles * np.isin(rows, [0, 1, 10, 11]), angles * np.isin(rows, [4, 5, 6, 7])]
+    weights += [angles * beside, angles * (1 - beside)]
+    for of_weighting, weight in zip(sums[:-1], weights, strict=True):
         expected = _in_loops(prediction, truth, weight)
         assert {n: float(s) for n, s in depth_scores(of_weighting).items()} == pytest.approx(
             expected, rel=1e-12
@@ -89,7 +92,7 @@ def test_images_count_the_same_and_images_without_truth_do_not_count() -> None:
     assert means == pytest.approx({n: (of_each[0][n] + of_each[1][n]) / 2 for n in of_each[0]})
     metric.reset()
     empty = dim_zero_cat(metric.of_images).numpy()
-    assert empty.shape == (0, 8, 10)
+    assert empty.shape == (0, 13, 10)
     assert all(math.isnan(value) for value in mean_depth_scores(empty[:, 0]).values())
 
 
@@ -99,7 +102,7 @@ def test_intervals_contain_the_mean_and_leave_out_images_without_truth() -> None
         [error_sums(*map(torch.from_numpy, _image(k))).numpy()[0] for k in range(12)]
         + [np.zeros(10)]
     )
-    intervals, means = depth_intervals(sums), mean_depth_scores(sums)
+    intervals, means = depth_intervals(depth_scores(sums)), mean_depth_scores(sums)
     assert intervals.keys() == means.keys()
     for name, (low, high) in intervals.items():
         assert low <= means[name] <= high, name
@@ -107,8 +110,8 @@ def test_intervals_contain_the_mean_and_leave_out_images_without_truth() -> None
     error = scores.std(ddof=1) / math.sqrt(12)
     low, high = intervals["absrel"]
     assert (high - low) / (2 * 1.96 * error) == pytest.approx(1, abs=0.15)
-    assert depth_intervals(sums[::-1]) == intervals
-    assert depth_intervals(sums[:1]) == {}
+    assert depth_intervals(depth_scores(sums[::-1])) == intervals
+    assert depth_intervals(depth_scores(sums[:1])) == {}
 
 
 @pytest.mark.parametrize("quantity", ["distance", "disparity"])

@@ -56,7 +56,7 @@ def example_result(
     flat = flat_settings(OmegaConf.to_container(config))  # type: ignore[arg-type]
     present = [value for value in scores if value is not None]
     columns, mean = ClassesHead.columns, sum(present) / len(present)
-    of_class = [column.of_class for column in columns.values()]
+    of_class = [column.of_class for column in columns.values() if column.of_class]
     return EvaluationResult(
         "panoramas",
         5,

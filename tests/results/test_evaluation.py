@@ -40,7 +40,8 @@ def _matrices(pixels: dict[tuple[int, int], int] | None = None) -> SegmentationC
         erp[place] = count
     bands = np.zeros((6, 4, 4), np.int64)
     bands[2] = erp
-    return SegmentationCounts(erp, erp / 10, bands, np.zeros((0, 2, 3, 3)))
+    no_images = np.zeros((0, 2, 3, 3)), np.zeros((0, 5, 3, 3)), np.zeros((0, 6))
+    return SegmentationCounts(erp, erp / 10, bands, *no_images)
 
 
 def _record(
@@ -62,7 +63,7 @@ def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:
     assert (read["images"], read["noun"]) == (7, "panoramas")
     assert read["columns"]["miou"] == {
         "text": "mIoU", "unit": "%", "of_class": "iou", "class_text": "IoU",
-        "better": "higher", "is_main": True,
+        "better": "higher", "is_main": True, "of_sphere": False,
     }  # fmt: skip
     assert read["scores"]["macc"] == read["scores"]["macc_solid_angle"] == (0.9 + 0.5) / 2
     assert read["scores"]["miou"] == (90 / 150 + 50 / 110) / 2

@@ -71,11 +71,8 @@ def test_printed_classes_fit_100_columns_the_largest_first(
     assert table.markdown().count("long_name_") == count
 
 
-def test_long_notes_are_printed_in_part(capsys: pytest.CaptureFixture[str]) -> None:
-    note = ", ".join(f"class {k}" for k in range(150))
-    table = Table("", ("name", "score"), [("a", "1")], note)
-    table.print()
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "class 9, " in printed
-    assert "class 149" not in printed
-    assert note in table.markdown()
+def test_a_note_names_the_first_absent_classes() -> None:
+    names = [f"class_{k}" for k in range(150)]
+    result = example_result([0.5, *[None] * 149], names)
+    table = result_tables(replace(result, confusion=[[0] * 151] * 151))[0]
+    assert table.note.endswith(": " + ", ".join(names[1:26]) + ", … 124 more.")

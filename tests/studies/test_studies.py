@@ -18,11 +18,14 @@ from studies.distorted_digits import BODY, distort, enlarge, mean_enlargement, p
 from studies.fov import fov
 from studies.methods import KINDS, picture, table
 from studies.output import markdown
-from studies.point_views import SIDE, drawn
+from studies.point_views import SIDE, drawn, titled
 from studies.representation_distortion import representation_distortion
 from studies.rotation_error import icosahedral_rotations, mean_error
 from studies.strips import write_strips
 from studies.surface_area import surface_area
+from studies.transfer import STAGES
+from studies.transfer import picture as picture_of_transfer
+from studies.transfer import table as table_of_transfer
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.geometry.icosphere import icosphere_directions
 from tangent_train.rendering import IcosphereRepresentation
@@ -143,6 +146,21 @@ def test_constant_depths_minimize_their_errors() -> None:
     row = steps[:, 3][steps[:, 3] > 0] / 512
     assert found["median of the row"].shape == (8, 1)
     assert found["median of the row"][3, 0] == pytest.approx(np.median(row))
+
+
+def test_rows_of_points_are_below_their_titles() -> None:
+    row = np.full((SIDE, 3 * SIDE, 3), 255, np.uint8)
+    row[100:150, 200:300] = 9
+    picture = titled({"true": row, "predicted": row})
+    assert picture.shape == (2 * (56 + 50 + 16), 3 * SIDE, 3)
+    np.testing.assert_array_equal(picture[56:106], row[100:150])
+
+
+def test_the_chart_of_a_transfer_has_all_stages() -> None:
+    means, bands = picture_of_transfer().axes
+    assert {text.get_text() for text in means.get_yticklabels()} == {*STAGES.values()}
+    assert STAGES.keys() == {row["stage"] for row in table_of_transfer("transfer")}
+    assert len(bands.lines) == 5
 
 
 def test_points_are_drawn_from_three_sides() -> None:

@@ -1,0 +1,307 @@
+"""Score the files of any program against the test images of a data set, without a network."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from datamodules.core.image_module import PanoramaDataModule
+from datamodules.core.label_map import LabelMap, read_label_map
+from tangent_train.callbacks.pictures import Pictures
+from tangent_train.cli.run import Run, build_data, build_head
+from tangent_train.config.settings import EvaluateSettings, refuse_typed
+from tangent_train.console import print_text
+from tangent_train.errors import DataError, SettingError, counted, width_height
+from tangent_train.geometry.sphere import check_area
+from tangent_train.heads.pictures import evenly_spread
+from tangent_train.io.gpano import read_area
+from tangent_train.io.image_files import composed, walk_files
+from tangent_train.io.pixel_files import read_depth_m, read_image_size
+from tangent_train.progress import show_progress
+from tangent_train.rendering.resampling import resize
+from tangent_train.results.tables import score_text
+from tangent_train.threads import in_threads
+
+OF_FILES = ("values", "files", "resample", "depth_scale", "depth_channel")
+"""Settings that are read with `predictions` only."""
+
+_OF_NETWORKS = (
+    *("checkpoint", "trust", "label_map", "unmapped", "level", "trainer", "logger"),
+    *("representation(?!.erp_height)", "data.inputs", "data.normalization"),
+    *("data.test_rotation", "data.upright"),
+)
+_ARRAYS = (".npy", ".npz")
+_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".exr", *_ARRAYS)
+_NO_CLASS = (255, 65535)
+_NAMED = 10
+_COMPARED = 8
+_MISTAKES: dict[str, Callable[[Tensor], Tensor]] = {
+    "mirrored left to right": lambda pixels: pixels.flip(1),
+    "upside down": lambda pixels: pixels.flip(0),
+    "shifted by half the width": lambda pixels: pixels.roll(pixels.shape[1] // 2, 1),
+}
+"""Usual mistakes in the orientation of predictions."""
+
+
+def score_files(settings: EvaluateSettings, folder: Path) -> None:
+    """Evaluate predictions in files on the test images of the data, and write the results.
+
+    Args:
+        settings: Settings of the command.
+        folder: Output folder.
+
+    Raises:
+        SettingError: A setting does not suit the data, or is that of a network.
+        DataError: No prediction can be used.
+    """
+    predictions: Any = settings.predictions
+    refuse_typed(_OF_NETWORKS, "nothing: predictions= is scored without a network")
+    rows = (settings.representation or {}).get("erp_height")
+    data = _data(settings, rows)
+    head = build_head(settings, data, "metric_distance" if data.has_distances else None)
+    scored = ScoredFiles(settings, data, head)
+    metric = head.build_metric()
+    pictures = Pictures(folder / "panels", settings.panels)
+    task = SimpleNamespace(network=None, head=head, representation=data.representation)
+    groups: dict[str, list[int]] = defaultdict(list)
+    variants = {name: head.build_metric() for name in ("as they are", *_MISTAKES)}
+    compared = evenly_spread(_COMPARED, len(scored.indices))
+
+    def score() -> Iterator[None]:
+        for place, (index, found) in enumerate(in_threads(scored.read, scored.indices)):
+            if found is not None:
+                for group in data.groups(scored.items[index]):
+                    groups[group].append(len(scored.done))
+                truth, prediction = map(torch.from_numpy, found)
+                comparable = head.comparable(prediction, head.truth(truth))
+                metric.update(comparable, head.truth(truth))
+                for name, of_variant in variants.items() if place in compared else ():
+                    turned = _MISTAKES.get(name, torch.clone)(prediction)
+                    of_variant.update(head.comparable(turned, head.truth(truth)), head.truth(truth))
+                pictures.draw(task, data.dataset("test"), index, None, truth, comparable)
+                scored.done.append(index)
+            yield
+
+    show_progress(score(), "Scoring", data.noun, len(scored.indices))
+    scored.print_problems()
+    if not scored.done:
+        raise DataError(
+            settings.predictions,
+            found=f"no usable prediction for {counted(len(scored.items), data.noun)}",
+            expected=f"files named as the images, such as {scored.items[0].name}.png",
+            remedy="Or give files=, a CSV file with the columns image and prediction.",
+        )
+    task.result, task.evaluated = metric.compute(), len(scored.done)
+    _warn_of_mistakes(head, variants)
+    settings = settings.model_copy(update={"representation": {"erp_height": data.erp_height}})
+    run = Run(folder, settings, data, task, facts=scored.facts)
+    run.write_settings()
+    run.report(predictions, groups, [pictures])
+
+
+def _warn_of_mistakes(head: Any, variants: Mapping[str, Any]) -> None:
+    """Print a warning if predictions fit better when they are turned over."""
+    column = head.columns[head.main_score]
+    scores = {
+        name: head.scores(metric.compute()).means[head.main_score]
+        for name, metric in variants.items()
+    }
+    best = min if column.better == "lower" else max
+    name = best(scores, key=lambda name: scores[name])
+    if name != "as they are":
+        found, usual = (score_text(scores[n], column.unit) for n in (name, "as they are"))
+        print_text(
+            f"Warning: {name}, predictions score {column.text} {found} instead of {usual} on up to "
+            f"{_COMPARED} images. Do they have the orientation of the images?",
+            error=True,
+        )
+
+
+def _data(settings: EvaluateSettings, rows: int | None) -> Any:
+    """Build the data module; without a number of rows its panoramas have those of the first."""
+    views = {"_target_": "tangent_train.rendering.EquirectRepresentation", "level": 0}
+    section = views | {"erp_height": rows or 2}
+    data = build_data(settings.model_copy(update={"representation": section}))
+    if not isinstance(data, PanoramaDataModule):
+        raise SettingError("data", found=type(data).__name__, expected="panoramas, not photos")
+    if rows is not None:
+        return data
+    image = data.splits()["test"][0].rgb
+    area = read_area(image, read_image_size(image), check_area(data.area))
+    return _data(settings, area.full_shape[0])
+
+
+class ScoredFiles:
+    """Files with predictions, matched with the test images of a data set.
+
+    Attributes:
+        items: Files of all test images.
+        indices: Places of the images that have a prediction.
+        done: Places of the images that were scored.
+    """
+
+    def __init__(self, settings: EvaluateSettings, data: Any, head: Any) -> None:
+        self._settings, self._data, self._head = settings, data, head
+        self.items = data.splits()["test"]
+        self._paths, self._extra = self._matched()
+        self.indices = [k for k, files in enumerate(self.items) if files.name in self._paths]
+        self.done: list[int] = []
+        self._problems: list[DataError] = []
+        self._resampled: set[str] = set()
+        self._map = None if data.has_distances else self._label_map()
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """Facts of the protocol: images without a usable prediction, and other sizes."""
+        total, done = len(self.items), len(self.done)
+        facts = {} if done == total else {"images": f"{done} of {total}"}
+        if self._resampled:
+            sizes = ", ".join(sorted(self._resampled))
+            facts["resampled"] = f"{self._settings.resample}, from {sizes}"
+        return facts
+
+    def print_problems(self) -> None:
+        """Print what was not scored."""
+        missing = [files.name for files in self.items if files.name not in self._paths]
+        for noun, names in (
+            ("images without a prediction", missing),
+            ("files of no test image", [str(path) for path in self._extra]),
+            ("unusable predictions", [str(error) for error in self._problems]),
+        ):
+            if names:
+                listed = "".join(f"\n  {name}" for name in names[:_NAMED])
+                more = f"\n  … {len(names) - _NAMED} more" * (len(names) > _NAMED)
+                print_text(f"{counted(len(names), noun)}:{listed}{more}", error=True)
+
+    def _folder(self) -> Path:
+        """Return the folder of the files: of an output folder of this project, a part of it."""
+        given: Any = self._settings.predictions
+        kind = given / ("depth" if self._data.has_distances else "labels")
+        return kind if kind.is_dir() else given
+
+    def _matched(self) -> tuple[dict[str, Path], list[Path]]:
+        """Return the file of each image, by its name or the last part of it; and the others."""
+        folder, listed = self._folder(), self._settings.files
+        files = [path for path in walk_files(folder) if path.suffix.lower() in _SUFFIXES]
+        named = [(path.relative_to(folder).as_posix(), path) for path in files]
+        if listed is not None:
+            with listed.open(newline="", encoding="utf-8-sig") as lines:
+                rows = list(csv.DictReader(lines))
+            if not rows or not {"image", "prediction"} <= rows[0].keys():
+                expected = "a CSV file with the columns image and prediction"
+                raise DataError(
+                    listed, found=", ".join(rows[0]) if rows else "no row", expected=expected
+                )
+            named = [(row["image"], folder / row["prediction"]) for row in rows]
+        paths: dict[str, set[Path]] = defaultdict(set)
+        for name, path in named:
+            stem = composed(name.removesuffix(PurePosixPath(name).suffix))
+            for key in (composed(name), stem, stem.rpartition("/")[2]):
+                paths[key].add(path)
+        stems = Counter(item.rgb.stem for item in self.items)
+        found = {}
+        for item in self.items:
+            keys = [item.name, *[composed(item.rgb.stem)] * (stems[item.rgb.stem] == 1)]
+            matches = [paths[key] for key in keys if len(paths[key]) == 1]
+            if matches:
+                (found[item.name],) = matches[0]
+        return found, sorted({*files} - {*found.values()})
+
+    def _label_map(self) -> LabelMap:
+        """Return the labels of the values in the files."""
+        data, values = self._data, self._settings.values
+        own: Any = self._settings.predictions
+        if values is None and (own / "classes.json").is_file():
+            values = own / "classes.json"
+        classes = data.class_names[1:]
+        if values in (None, "from_1", "from_0"):
+            start = 0 if values == "from_0" else 1
+            unknown = [*_NO_CLASS, *range(start)]
+            return LabelMap.of({name: k for k, name in enumerate(classes, start)}, unknown)
+        if values == "ids":
+            label_map: LabelMap = data.label_map
+            return label_map
+        found = read_label_map(Path(values))
+        if foreign := set(found.names) - set(classes):
+            listed = ", ".join(sorted(foreign)[:_NAMED])
+            raise DataError(values, found=listed, expected=f"classes of {', '.join(classes)}")
+        return replace(found.regrouped(classes), refuses_others=found.refuses_others)
+
+    def read(self, index: int) -> tuple[int, tuple[NDArray[Any], NDArray[Any]] | None]:
+        """Return the place of an image, its labels and its prediction; None if it is unusable."""
+        path, source = self._paths[self.items[index].name], self._data.dataset("test")
+        canvas = self._data.canvas
+        try:
+            prediction = self._read(path)
+            truth = source.labels(index) if canvas.is_whole else source.read(index).labels
+            if truth.ndim != 2:  # without the masked pixels
+                truth = source.read(index).labels
+            shapes, how = (canvas.full_shape, canvas.image_shape), self._settings.resample
+            if prediction.shape not in shapes and how is None:
+                self._problems.append(
+                    DataError(
+                        path,
+                        found=width_height(prediction.shape),
+                        expected=width_height(canvas.image_shape),
+                        remedy="Give resample=nearest to score it at this size.",
+                    )
+                )
+                return index, None
+            if prediction.shape not in shapes:
+                self._resampled.add(width_height(prediction.shape))
+                interpolation: Any = "bilinear" if how == "linear" else "nearest"
+                prediction = resize(prediction, canvas.image_shape, interpolation)
+            if prediction.shape != canvas.full_shape:
+                prediction = canvas.place(prediction)
+        except DataError as error:
+            self._problems.append(error)
+            return index, None
+        truth = truth.astype(np.int32) if truth.dtype == np.uint16 else truth
+        return index, (np.array(truth), np.array(prediction))
+
+    def _read(self, path: Path) -> NDArray[Any]:
+        settings, label_map = self._settings, self._map
+        if label_map is None:
+            if path.suffix.lower() == ".npz":
+                raise DataError(path, found="an archive", expected="distances: .npy, EXR or PNG")
+            depth = read_depth_m(path, settings.depth_scale, settings.depth_channel)
+            return np.where(depth > 0, depth, np.float32(np.nan))
+        if path.suffix.lower() not in _ARRAYS:
+            return label_map.read_labels(path)
+        array = _array(path)
+        if array.ndim == 2 and array.dtype.kind in "iub":
+            none = np.array(_NO_CLASS[1], np.int64)
+            return label_map.decode(np.where(array < 0, none, array), path)
+        count = len(label_map.names)
+        axes = [axis for axis in (0, 2) if array.ndim == 3 and array.shape[axis] == count]
+        if len(axes) != 1 or array.dtype.kind != "f":
+            found = f"{array.dtype} of shape {array.shape}"
+            expected = f"integers (H, W), or scores ({count}, H, W) or (H, W, {count})"
+            raise DataError(path, found=found, expected=expected)
+        best = array.argmax(axis=axes[0]) + 1
+        known = np.isfinite(array.max(axis=axes[0]))
+        return np.where(known, best, 0).astype(np.uint8)
+
+
+def _array(path: Path) -> NDArray[Any]:
+    """Read an array; of an archive its only one."""
+    try:
+        content: Any = np.load(path, allow_pickle=False)
+        if isinstance(content, Mapping):
+            (name,) = content
+            content = content[name]
+    except (ValueError, OSError, EOFError) as error:
+        expected = "a .npy file, or a .npz file with one array"
+        raise DataError(path, found=str(error), expected=expected) from error
+    array: NDArray[Any] = content
+    return array
