@@ -114,7 +114,8 @@ def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
         "nearest, CUDA graphs": {"mode": "reduce-overhead"},
     }
     for name, compiler in compilers.items():
-        views = ViewSelector(trained, blend=name.partition(",")[0])
+        blend: Any = name.partition(",")[0]
+        views = ViewSelector(trained, blend=blend)
         predictor = Predictor(trained, head_of(trained), views, DEVICE.type, compile=compiler)
         if compiler is None or ON_GPU:
             call = partial(predicted, predictor)

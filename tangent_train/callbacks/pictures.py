@@ -77,7 +77,7 @@ class Pictures(Callback):
         for result in zip(batch.index.tolist(), confidences, batch.labels, outputs, strict=True):
             self.draw(pl_module, _dataset(trainer, "test"), *result)
 
-    def draw(self, task: Any, source: Any, index: int, confidence: Any, *labels: Tensor) -> None:
+    def draw(self, task: Any, source: Any, index: int, confidence: Any, *labels: Any) -> None:
         """Draw a test image, if it is one of the chosen ones.
 
         Args:

@@ -33,10 +33,11 @@ def evaluate(settings: EvaluateSettings) -> None:
         score_files(settings, folder)
         return
     refuse_typed(OF_FILES, "nothing: it is read with predictions=")
-    if settings.checkpoint is None:
+    checkpoint = settings.checkpoint
+    if checkpoint is None:
         expected = "a network, or predictions=<folder>"
         raise SettingError("checkpoint", found="null", expected=expected)
-    loaded = load_network(settings.checkpoint, settings.trust)
+    loaded = load_network(checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])
     loaded.check_predicts(head.kind, remedy)
@@ -59,7 +60,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
     rank_zero_only(run.write_settings)()
-    run.test(run.trainer(), settings.checkpoint)
+    run.test(run.trainer(), checkpoint)
 
 
 @rank_zero_only

@@ -479,7 +479,10 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     )
 
     checkpoint: ExistingPath | None = None  # type: ignore[assignment]
-    """network, written by tangent-train, tangent-import or tangent-export; null with predictions"""
+    """network file, written by tangent-train, tangent-import or tangent-export; required without
+    predictions="""
+
+    # --- predictions of any program ---
     predictions: ExistingPath | None = None
     """folder of predictions of any program, which are scored instead of a network: label maps,
     class scores or distances of panoramas, named as the images"""
@@ -496,6 +499,8 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     """predictions: units per meter in depth files of integers"""
     depth_channel: str | None = None
     """predictions: channel of OpenEXR files; null = as tangent-predict"""
+
+    # --- views ---
     representation: Section | None = None  # type: ignore[assignment]
     """views of a panorama that the network receives; null = as in the checkpoint"""
     level: Level | None = None  # type: ignore[assignment]

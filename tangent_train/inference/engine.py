@@ -244,7 +244,7 @@ class Predictor:
     def _compiled(self, network: Any) -> Any:
         if self._compile is None:
             return network
-        compiled = torch.compile(network, **self._compile)
+        compiled: Any = torch.compile(network, **self._compile)
         # The next call of a CUDA graph overwrites the output of the last.
         return lambda *given, **named: plain_output(compiled(*given, **named)).clone()
 

@@ -176,7 +176,7 @@ def test_modules_run_as_commands(tmp_path: Path) -> None:
         ("keypoints", "output="),
         ("train", "data= or experiment="),
         ("train -m seed=1,2", "data= or experiment="),
-        ("evaluate level=5", "data= or experiment=, checkpoint="),
+        ("evaluate level=5", "data= or experiment="),
         ("transfer", "data= or experiment="),
     ],
 )

@@ -121,6 +121,8 @@ def explained(command: str, *overrides: str) -> str:
 def unexplained(text: str) -> list[str]:
     """Lines of the settings in a help text without a comment beside or below them."""
     joined = re.sub(r"\n {32}# ", " # ", text)
+    for _ in range(text.count("\n")):  # of long values
+        joined = re.sub(r"^( *\w+: [\[{][^#\n]*[^#\n\]}])\n +", r"\1 ", joined, flags=re.MULTILINE)
     lines = [line for line in joined.splitlines()[1:] if line and not line.startswith("# ---")]
     return [line for line in lines if " # " not in line]
 

@@ -285,17 +285,17 @@ def test_layouts_that_the_metadata_state(
 
 
 _HALF = dict(zip(PART_TAGS, ("256", "128", "128", "64", "64", "32"), strict=True))
-_WHOLE = {"Spherical": "true", "Stitched": "true", "ProjectionType": "equirectangular"}
+_STATED = {"Spherical": "true", "Stitched": "true", "ProjectionType": "equirectangular"}
 
 
 @pytest.mark.parametrize(
     ("tags", "error"),
     [
-        (_WHOLE | {"InitialViewPitchDegrees": "20"}, None),
-        (_WHOLE | _HALF, None),
-        (_WHOLE | {"StereoMode": "top-bottom"}, None),
-        (_WHOLE | {"StereoMode": "custom"}, "stereo of custom"),
-        (_WHOLE | {"Stitched": "false"}, "pictures that are not stitched"),
+        (_STATED | {"InitialViewPitchDegrees": "20"}, None),
+        (_STATED | _HALF, None),
+        (_STATED | {"StereoMode": "top-bottom"}, None),
+        (_STATED | {"StereoMode": "custom"}, "stereo of custom"),
+        (_STATED | {"Stitched": "false"}, "pictures that are not stitched"),
     ],
 )
 def test_spherical_video_v1(tmp_path: Path, tags: dict[str, str], error: str | None) -> None:

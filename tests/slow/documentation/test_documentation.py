@@ -29,6 +29,7 @@ OTHERS = [block for block in BLOCKS if block not in RUN and block.commands]
 ELSEWHERE = ("hydra.", "launcher=", "sweep=")
 READ_FILES = (
     "checkpoint",
+    "predictions",
     "file",
     "init_from",
     "mask",
