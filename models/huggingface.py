@@ -70,6 +70,12 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
     return {"model_type": kind.model_type, **known}
 
 
+def _names(settings: Mapping[str, Any], prefix: str = "") -> set[str]:
+    """Return the names of settings and of settings inside them."""
+    inner = (_names(v, f"{prefix}{n}.") for n, v in settings.items() if isinstance(v, Mapping))
+    return {f"{prefix}{name}" for name in settings}.union(*inner)
+
+
 def _patch_size(config: Any) -> int:
     """Return the side in pixels of the patches that a network reads whole; 1 without patches."""
     inside = getattr(config, "backbone_config", None) or config
@@ -98,12 +104,27 @@ class _TransformersNetwork(nn.Module):
     ) -> None:
         super().__init__()
         known = architecture(config)
+        unknown = _names(config) - _names(known)
+        if unknown:
+            raise SettingError(
+                f"network.config.{min(unknown)}",
+                found="a value",
+                expected=f"settings that transformers declares for {known['model_type']}",
+            )
         import transformers as hf
 
         kind = known["model_type"]
-        task = next((task for task in tasks if kind in network_types(task)), tasks[0])
+        fitting = [task for task in tasks if kind in network_types(task)]
+        if not fitting:
+            names = sorted({name for task in tasks for name in network_types(task)})
+            words = " or ".join(task.lower().replace("_", " ") for task in tasks)
+            raise SettingError(
+                "network.config.model_type",
+                found=kind,
+                expected=f"a network for {words} ({', '.join(names)})",
+            )
         made = hf.AutoConfig.for_model(**known, **labels)
-        auto: Any = getattr(hf, f"AutoModelFor{task.title().replace('_', '')}")
+        auto: Any = getattr(hf, f"AutoModelFor{fitting[0].title().replace('_', '')}")
         self.network: Any = auto.from_config(made, trust_remote_code=False)
         self._bgr = bgr
         self.size_multiple = _patch_size(made)

@@ -186,29 +186,41 @@ class SphereContext(nn.Module):
     def _in_chunks(self, images: Tensor, rays: Tensor, size: int) -> Any:
         """Encode in chunks, mix the tokens of all, decode in chunks."""
         chunks = torch.tensor_split(images, -(-len(images) // size))  # even ones
-        tokens = [self._recomputed(self.encode, chunk, is_counted=False) for chunk in chunks]
+        # Evaluation uses no random numbers.
+        first = int(torch.randint(2**62, ())) if self.training else 0
+        seeds = range(first, first + len(chunks))
+        tokens = [
+            self._recomputed(self.encode, chunk, seed=seed, counted=False)
+            for chunk, seed in zip(chunks, seeds, strict=True)
+        ]
         contexts = torch.tensor_split(self.mix(rays, torch.cat(tokens)), len(chunks))
         parts = [
-            self._recomputed(self.decode, chunk, context, is_counted=True)
-            for chunk, context in zip(chunks, contexts, strict=True)
+            self._recomputed(self.decode, chunk, context, seed=seed, counted=True)
+            for chunk, context, seed in zip(chunks, contexts, seeds, strict=True)
         ]
         if isinstance(parts[0], Tensor):
             return torch.cat(parts)
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
-    def _recomputed(self, step: Callable[..., Any], *arguments: Tensor, is_counted: bool) -> Any:
+    def _recomputed(
+        self, step: Callable[..., Any], *arguments: Tensor, seed: int, counted: bool
+    ) -> Any:
         """Run a step without keeping activations; the backward pass runs it again.
 
-        Only one run of a chunk (the first, if `is_counted`) updates the running statistics of batch
-        normalization.
+        All runs of a chunk draw the same random numbers, and only one of them (the first, if
+        `counted`) updates the running statistics of batch normalization.
         """
-        first = iter([is_counted])
+        first = iter([counted])
 
         def run(*inputs: Tensor) -> Any:
-            with _frozen_statistics(() if next(first, False) else self.network.modules()):
+            frozen = () if next(first, False) else self.network.modules()
+            device = inputs[0].device
+            forked = torch.random.fork_rng([device] if device.type == "cuda" else [])
+            with forked, _frozen_statistics(frozen):
+                torch.manual_seed(seed)
                 return step(*inputs)
 
-        return checkpoint(run, *arguments, use_reentrant=False)
+        return checkpoint(run, *arguments, use_reentrant=False, preserve_rng_state=False)
 
 
 def token_directions(

@@ -201,6 +201,34 @@ def test_evaluation_and_errors_leave_no_traces() -> None:
     torch.testing.assert_close(dict(context.named_buffers()), before, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_chunk_drops_out_the_same_in_every_run(device: str) -> None:
+    encoder = nn.Sequential(nn.Conv2d(3, 8, 1), nn.Dropout(0.5))
+    network = nn.Sequential(encoder, nn.Conv2d(8, 4, 1))
+    context = SphereContext(network, "0", ATTENTION, in_channels=3, tokens=2).double().train()
+    awake(context.to(device).mixer)
+    images = torch.randn(6, 3, 8, 8).double().to(device)
+    rays = sphere_rays(6).double().to(device)
+    dropped: list[Tensor] = []
+    encoder[1].register_forward_hook(lambda _m, _i, result: dropped.append(result == 0))
+    generator: Any = torch if device == "cpu" else torch.cuda
+    torch.manual_seed(3)
+    _, gradients = _gradients(context, images, rays, 3)
+    after = generator.get_rng_state()
+    # Two chunks: encoded, decoded, then both again for the gradient, the last one first.
+    assert len(dropped) == 8
+    assert not torch.equal(dropped[0], dropped[1]), "chunks draw differently"
+    for chunk in dropped[:2]:
+        assert sum(torch.equal(run, chunk) for run in dropped) == 4
+    assert 0.3 < float(dropped[0].float().mean()) < 0.7
+    torch.manual_seed(3)
+    assert torch.equal(generator.get_rng_state(), after) == (device == "cuda")
+    _, again = _gradients(context, images, rays, 3)
+    tolerance = 0 if device == "cpu" else 1e-9  # a GPU adds in varying order
+    torch.testing.assert_close(again, gradients, rtol=tolerance, atol=tolerance)
+    assert torch.equal(generator.get_rng_state(), after)
+
+
 @GPU
 def test_scores_and_gradients_on_a_gpu_are_those_of_the_cpu() -> None:
     context = small_context().double().eval()

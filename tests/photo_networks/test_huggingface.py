@@ -13,6 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from models import HuggingFaceNetwork
 from tangent_train.errors import DataError, SettingError
 from tangent_train.photo_networks import huggingface
 from tests.photo_networks import huggingface_networks as networks
@@ -187,7 +188,7 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
             {"depths": [2, 1, 1, 1]},
             "found other weights: no .*as described in config",
         ),
-        ("config.json", {"model_type": "bert"}, "config.json: found network cannot be built"),
+        ("config.json", {"model_type": "bert"}, "model_type: found bert; expected a network for"),
         ("config.json", {"hidden_act": "https://x.org/gelu"}, "config.json: found network.config"),
         ("preprocessor_config.json", {"image_std": [0, 1, 1]}, "no normalization in"),
     ],
@@ -240,3 +241,9 @@ def test_models_of_the_hub_are_fetched_without_code(
     assert tuple(network.score_names) == networks.NAMES
     (patterns,) = requested.values()
     assert not [p for p in patterns if p.endswith((".py", ".bin", "*"))]
+
+
+def test_settings_that_transformers_does_not_know_are_refused() -> None:
+    config = {"model_type": "segformer", "depthz": [1, 1, 1, 1]}
+    with pytest.raises(SettingError, match=r"network\.config\.depthz: .* declares for segformer"):
+        HuggingFaceNetwork(config, 3)
