@@ -6,6 +6,7 @@ import csv
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -58,7 +59,7 @@ def spread(places: Sequence[float], gap: float) -> list[float]:
         short = np.maximum(gap - (moved[above] - moved[below]), 0)
         moved[below] -= short / 2
         moved[above] += short / 2
-    return moved.tolist()
+    return [float(place) for place in moved]
 
 
 def picture() -> Figure:
@@ -68,14 +69,14 @@ def picture() -> Figure:
     quality, cost = figure.subplots(1, 2)
     for name, by_level in times.items():
         color, marker, _ = KINDS[kind_of(name)]
-        look = {"color": color, "marker": marker, "ms": 5}
+        look: Any = {"color": color, "marker": marker, "ms": 5}
         time, score = by_level["level 5"], scores[name]["upright"]
         quality.plot(time, score, **look)
         # To the left where another point is close on the right.
         points = [(times[other]["level 5"], scores[other]["upright"]) for other in times]
         crowded = any(1 < x / time < 1.6 and abs(y - score) < 1 for x, y in points)
-        side = {"xytext": (-8 if crowded else 8, 0), "ha": "right" if crowded else "left"}
-        how = {"textcoords": "offset points", "va": "center", "fontsize": 9, "color": color}
+        side: Any = {"xytext": (-8 if crowded else 8, 0), "ha": "right" if crowded else "left"}
+        how: Any = {"textcoords": "offset points", "va": "center", "fontsize": 9, "color": color}
         quality.annotate(name, (time, score), **how, **side)
         levels = [int(column.split()[1]) for column in by_level]
         cost.plot(levels, list(by_level.values()), **look)

@@ -58,7 +58,7 @@ class ViewStitcher:
         # repeated: in the stack of all views, the next rows belong to another view.
         seen = (x >= -0.5) & (x <= columns - 0.5) & (y >= -0.5) & (y <= rows - 0.5)
         x, y = x.clip(0, columns - 1), y.clip(0, rows - 1) + owner * rows
-        self._maps = [np.where(seen, place, _NOWHERE).astype(np.float32) for place in (x, y)]
+        self._x, self._y = (np.where(seen, place, _NOWHERE).astype(np.float32) for place in (x, y))
 
     def stitch(
         self, views: Sequence[NDArray[Any]], interpolation: int, elsewhere: int = 0
@@ -71,8 +71,14 @@ class ViewStitcher:
                 distances.
             elsewhere: Value outside the views.
         """
-        border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": elsewhere}
-        return cv2.remap(np.concatenate(views), *self._maps, interpolation, **border)
+        return cv2.remap(
+            np.concatenate(views),
+            self._x,
+            self._y,
+            interpolation,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=elsewhere,
+        )
 
 
 def make_panoramas(

@@ -66,7 +66,8 @@ def render(settings: RenderSettings) -> None:
     if len(modes) != 1 or (settings.output or settings.figure) is None:
         found = " and ".join(modes) or "none of them"
         expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>, and output="
-        raise SettingError("input, back and poses", found=found, expected=expected)
+        remedy = "Example: tangent-render input=panoramas output=tangent"
+        raise SettingError("input, back and poses", found=found, expected=expected, remedy=remedy)
     run, read = _MODES[modes[0]]
     check_read(settings, {*read, *modes, "output", "overwrite"})
     run(settings, settings.model_dump(mode="json", exclude={*settings.not_content}))

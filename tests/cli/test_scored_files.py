@@ -167,6 +167,18 @@ def test_turned_predictions_are_noticed(
     assert name is None or f"{name}, predictions score mIoU 100.0 instead of" in error
 
 
+@pytest.mark.parametrize("is_placed", [False, True])
+def test_partial_panoramas(data: Any, run: Run, tmp_path: Path, is_placed: bool) -> None:
+    """Files of the part that the images show, or of whole panoramas."""
+    for name, truth in data.items():
+        whole = np.zeros((64, 128), np.uint8)
+        whole[16:48, 32:96] = truth
+        _save(tmp_path / "maps" / f"{name}.png", whole if is_placed else truth)
+    found = _scores(run, tmp_path, "found", "data.area=[-90,90,-45,45]")
+    assert (found["images"], found["scores"]["miou"]) == (3, 1)
+    assert found["protocol"]["size"] == "128 × 64"
+
+
 def test_distances(data: Any, run: Run, tmp_path: Path) -> None:
     """10 % too far: AbsRel is 0.1, by any weighting."""
     for name in (*data, "hall/3"):

@@ -1,4 +1,4 @@
-"""Commands of the documentation: those of README and tutorials are run, the others validated.
+"""Commands of README and tutorials are run, and Python of guides; other commands are validated.
 
 A command that names a file or placeholder that is not known here fails with its line: `world.py`
 has the files, `commands.py` what stands in for placeholders and the settings that make runs small.
@@ -24,7 +24,12 @@ BLOCKS = [
 ]
 
 
-RUN = [block for block in BLOCKS if block.location.startswith(("README", "docs/tutorials"))]
+RUN = [
+    block
+    for block in BLOCKS
+    if block.location.startswith(("README", "docs/tutorials"))
+    or (block.python and block.location.startswith("docs/how-to"))
+]
 OTHERS = [block for block in BLOCKS if block not in RUN and block.commands]
 ELSEWHERE = ("hydra.", "launcher=", "sweep=")
 READ_FILES = (
