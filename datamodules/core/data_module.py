@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import torch
 from lightning import LightningDataModule
+from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_only
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, NonNegativeInt, PositiveInt, ValidationError
@@ -366,6 +367,14 @@ class DataModule(LightningDataModule, ABC):
         """
         self.make_files()
         splits = self.splits()
+        fitting = self.trainer is not None and self.trainer.state.fn == TrainerFn.FITTING
+        if fitting and not splits["train"]:
+            raise DataError(
+                self.root,
+                found=f"no {self.noun} for training",
+                expected="one or more",
+                remedy="Train on other data; these are for tangent-evaluate and tangent-transfer.",
+            )
         items = [(split, files) for split in SPLITS for files in splits[split]]
         items = list(shard.part(items))
         if self.cache is not None:

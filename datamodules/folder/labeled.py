@@ -52,7 +52,7 @@ class LabeledFolder(ImageDataModule):
 
     cache_settings: ClassVar[tuple[str, ...]] = ("depth_units_per_m", "depth_channel")
 
-    test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    test_fraction: Annotated[float, Field(gt=0, le=1)] = 0.2
     split_seed: NonNegativeInt = 0
     depth_units_per_m: PositiveFloat = 1000
     depth_channel: str | None = None

@@ -32,29 +32,27 @@ def divide_images(
         root: Folder of the data set, with or without lists.
         images: All images of the data set.
         problems: Collects invalid lines of lists.
-        fractions: Share of the scenes to draw for the test: at least one, at most all but one. The
-            same of the training scenes for validation; 0 for no validation, even with a list.
+        fractions: Share of the scenes to draw for the test: at least one, at most all but one; 1
+            for all. The same of the training scenes for validation; 0 for no validation, even with a list.
         seed: Seed of the draw.
 
     Raises:
-        DataError: A list cannot be used, or there are no images for training or test.
+        DataError: A list cannot be used, or there are no images for the test.
     """
     listed = _read_lists(root, images, problems)
     rest = {files.name for files in images}.difference(*listed.values())
     held: set[str] = set()
-    if "test" in listed or "train" in listed:
+    if "test" in listed or "train" in listed or fractions[0] == 1:
         test = listed.get("test", rest)
     else:
         test = _draw("test", rest, fractions[0], seed)
     train = listed.get("train", rest - test)
-    if fractions[1]:
+    if fractions[1] and train:
         held = listed["val"] if "val" in listed else _draw("val", train, fractions[1], seed)
     chosen: dict[Split, set[str]] = {"train": train - held, "val": held, "test": test}
-    for split in SPLITS[::2]:
-        if not chosen[split]:
-            expected, remedy = "one or more", f"Add images, or name some in {split}.txt."
-            found = f"no images for {split}"
-            raise DataError(root, found=found, expected=expected, remedy=remedy)
+    if not test:
+        remedy = "Add images, name some in test.txt, or give data.test_fraction=1 to score all."
+        raise DataError(root, found="no images for test", expected="one or more", remedy=remedy)
     return {split: [f for f in images if f.name in chosen[split]] for split in SPLITS}
 
 

@@ -44,13 +44,14 @@ _ARRAYS = (".npy", ".npz")
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".exr", *_ARRAYS)
 _NO_CLASS = (255, 65535)
 _NAMED = 10
-_COMPARED = 8
+_COMPARED, _NOTED = 8, 0.05
 _MISTAKES: dict[str, Callable[[Tensor], Tensor]] = {
     "mirrored left to right": lambda pixels: pixels.flip(1),
     "upside down": lambda pixels: pixels.flip(0),
     "shifted by half the width": lambda pixels: pixels.roll(pixels.shape[1] // 2, 1),
 }
-"""Usual mistakes in the orientation of predictions."""
+"""Usual mistakes in the orientation of predictions. They are named if the score of some images is
+better without by a margin."""
 
 
 def score_files(settings: EvaluateSettings, folder: Path) -> None:
@@ -74,7 +75,8 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     pictures = Pictures(folder / "panels", settings.panels)
     task = SimpleNamespace(network=None, head=head, representation=data.representation)
     groups: dict[str, list[int]] = defaultdict(list)
-    variants = {name: head.build_metric() for name in ("as they are", *_MISTAKES)}
+    mistakes = _MISTAKES | ({} if data.has_distances else _numberings(data.num_classes))
+    variants = {name: head.build_metric() for name in ("as they are", *mistakes)}
     compared = evenly_spread(_COMPARED, len(scored.indices))
 
     def score() -> Iterator[None]:
@@ -86,8 +88,8 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
                 comparable = head.comparable(prediction, head.truth(truth))
                 metric.update(comparable, head.truth(truth))
                 for name, of_variant in variants.items() if place in compared else ():
-                    turned = _MISTAKES.get(name, torch.clone)(prediction)
-                    of_variant.update(head.comparable(turned, head.truth(truth)), head.truth(truth))
+                    other = mistakes.get(name, torch.clone)(prediction)
+                    of_variant.update(head.comparable(other, head.truth(truth)), head.truth(truth))
                 pictures.draw(task, data.dataset("test"), index, None, truth, comparable)
                 scored.done.append(index)
             yield
@@ -102,15 +104,23 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
             remedy="Or give files=, a CSV file with the columns image and prediction.",
         )
     task.result, task.evaluated = metric.compute(), len(scored.done)
-    _warn_of_mistakes(head, variants)
+    _warn_of_mistakes(head, variants, counted(len(compared), data.noun))
     settings = settings.model_copy(update={"representation": {"erp_height": data.erp_height}})
     run = Run(folder, settings, data, task, facts=scored.facts)
     run.write_settings()
     run.report(predictions, groups, [pictures])
 
 
-def _warn_of_mistakes(head: Any, variants: Mapping[str, Any]) -> None:
-    """Print a warning if predictions fit better when they are turned over."""
+def _numberings(num_classes: int) -> dict[str, Callable[[Tensor], Tensor]]:
+    """Return labels as if their numbers began with 0, or with 1 instead of 0."""
+    return {
+        "numbered from 0 (values=from_0)": lambda labels: (labels + 1) * (labels < num_classes),
+        "numbered from 1 (values=from_1)": lambda labels: labels - (labels > 0).to(labels.dtype),
+    }
+
+
+def _warn_of_mistakes(head: Any, variants: Mapping[str, Any], images: str) -> None:
+    """Print a warning if predictions fit much better when they are changed."""
     column = head.columns[head.main_score]
     scores = {
         name: head.scores(metric.compute()).means[head.main_score]
@@ -118,11 +128,11 @@ def _warn_of_mistakes(head: Any, variants: Mapping[str, Any]) -> None:
     }
     best = min if column.better == "lower" else max
     name = best(scores, key=lambda name: scores[name])
-    if name != "as they are":
+    if abs(scores[name] - scores["as they are"]) > _NOTED:
         found, usual = (score_text(scores[n], column.unit) for n in (name, "as they are"))
         print_text(
-            f"Warning: {name}, predictions score {column.text} {found} instead of {usual} on up to "
-            f"{_COMPARED} images. Do they have the orientation of the images?",
+            f"Warning: {name}, predictions score {column.text} {found} instead of {usual} on "
+            f"{images}.",
             error=True,
         )
 
@@ -173,15 +183,15 @@ class ScoredFiles:
     def print_problems(self) -> None:
         """Print what was not scored."""
         missing = [files.name for files in self.items if files.name not in self._paths]
-        for noun, names in (
-            ("images without a prediction", missing),
-            ("files of no test image", [str(path) for path in self._extra]),
-            ("unusable predictions", [str(error) for error in self._problems]),
+        for noun, what, names in (
+            ("images", " without a prediction", missing),
+            ("files", " of no test image", [str(path) for path in self._extra]),
+            ("unusable predictions", "", [str(error) for error in self._problems]),
         ):
             if names:
                 listed = "".join(f"\n  {name}" for name in names[:_NAMED])
                 more = f"\n  … {len(names) - _NAMED} more" * (len(names) > _NAMED)
-                print_text(f"{counted(len(names), noun)}:{listed}{more}", error=True)
+                print_text(f"{counted(len(names), noun)}{what}:{listed}{more}", error=True)
 
     def _folder(self) -> Path:
         """Return the folder of the files: of an output folder of this project, a part of it."""
@@ -234,7 +244,12 @@ class ScoredFiles:
         found = read_label_map(Path(values))
         if foreign := set(found.names) - set(classes):
             listed = ", ".join(sorted(foreign)[:_NAMED])
-            raise DataError(values, found=listed, expected=f"classes of {', '.join(classes)}")
+            expected = f"classes of {', '.join(classes)}"
+            remedy = (
+                "Give a JSON file with the values of each of these as values=; or predict with "
+                "label_map=, if tangent-predict wrote the files."
+            )
+            raise DataError(values, found=listed, expected=expected, remedy=remedy)
         return replace(found.regrouped(classes), refuses_others=found.refuses_others)
 
     def read(self, index: int) -> tuple[int, tuple[NDArray[Any], NDArray[Any]] | None]:

@@ -491,7 +491,8 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     of the data set's own files) | a JSON file as classes.json, also with colors; null = by
     classes.json in the folder, else from_1"""
     files: ExistingPath | None = None
-    """predictions: CSV file with the columns image and prediction; null = by the names of files"""
+    """predictions: CSV file with the columns image and prediction, a path in the folder; null = by
+    the names of files"""
     resample: Literal["nearest", "linear"] | None = None
     """predictions: brings other sizes to that of the labels: nearest | linear (distances); null =
     other sizes are not scored"""

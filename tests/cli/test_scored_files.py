@@ -129,7 +129,7 @@ def test_what_is_not_scored_is_named(data: Any, run: Run, tmp_path: Path, capsys
     found = _scores(run, tmp_path, "found")
     assert (found["images"], found["protocol"]["images"]) == (1, "1 of 3")
     error = capsys.readouterr().err
-    for text in ("1 images without a prediction:\n  hall/2", "stranger.png", "found 32 × 16"):
+    for text in ("1 image without a prediction:\n  hall/2", "stranger.png", "found 32 × 16"):
         assert text in error
     resampled = _scores(run, tmp_path, "resampled", "resample=nearest")
     assert resampled["protocol"]["images"] == "2 of 3"
@@ -154,6 +154,7 @@ def test_files_are_matched_by_a_list(data: Any, run: Run, tmp_path: Path) -> Non
         (lambda labels: labels[:, ::-1], "mirrored left to right"),
         (lambda labels: labels[::-1], "upside down"),
         (lambda labels: np.roll(labels, 32, axis=1), "shifted by half the width"),
+        (lambda labels: np.maximum(labels, 1) - 1, "numbered from 0 (values=from_0)"),
     ],
 )
 def test_turned_predictions_are_noticed(
@@ -165,6 +166,7 @@ def test_turned_predictions_are_noticed(
     error = capsys.readouterr().err
     assert ("Warning" in error) == (name is not None)
     assert name is None or f"{name}, predictions score mIoU 100.0 instead of" in error
+    assert name is None or " on 3 panoramas." in error
 
 
 @pytest.mark.parametrize("is_placed", [False, True])

@@ -98,6 +98,8 @@ def test_data_sets_of_few_scenes_train(tmp_path: Path, erp: Any) -> None:
     single = write_data_set(tmp_path / "single", scenes=1, each=1, height=16)
     with pytest.raises(DataError, match="found no images for test"):
         FolderPanoramas(single, erp).setup()
+    every = _all_names(FolderPanoramas(one, erp, test_fraction=1))
+    assert [len(every[split]) for split in SPLITS] == [0, 0, 5]
 
 
 @pytest.mark.parametrize(
