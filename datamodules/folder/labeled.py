@@ -64,6 +64,7 @@ class LabeledFolder(ImageDataModule):
     def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
         images = self._list_images()
+        self._note_ignored(images)
         fractions = self.test_fraction, self.val_fraction
         with self.problems.noted():  # all images are checked even without splits
             return divide_images(self.root, images, self.problems, fractions, self.split_seed)
@@ -97,6 +98,20 @@ class LabeledFolder(ImageDataModule):
                     files = files._replace(depth=image_files.find_depth(depths, name, remedy))
             found.setdefault(name, files)
         return [found[name] for name in sorted(found)]
+
+    def _note_ignored(self, images: Sequence[ImageFiles]) -> None:
+        """Warn of files that training passes over: labels of no image, and no images."""
+        names = {files.name for files in images}
+        folder = self.root / ("depth" if self.has_distances else "labels")
+        strays = sorted({_name(folder, path) for path in image_files.walk_files(folder)} - names)
+        if strays:
+            found = f"{len(strays)} without an image, e.g. {repr(strays[0])[1:-1]}"
+            self.problems.warnings.append(f"{folder}: {found}")
+        folder = self.root / "images"
+        others = {*image_files.walk_files(folder)} - {files.rgb for files in images}
+        suffixes = {path.suffix.lower() for path in others}
+        if unknown := sorted(suffixes - {*image_files.IMAGE_SUFFIXES}):
+            self.problems.warnings.append(f"{folder}: files {', '.join(unknown)} are not images")
 
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`."""

@@ -118,12 +118,14 @@ def test_files_that_cannot_be_used(own_root: Path, erp: Any) -> None:
     save(own_root / "labels/scene_1/view.1.png", np.zeros((32, 64, 3), np.uint8))
     write_panorama(own_root, "scene_2/view.1", 0, suffix=".jpg")
     (own_root / "depth/scene_3/view.1.png").unlink()
+    save(own_root / "labels/scene_9/stray.png", np.zeros((32, 64), np.uint8))
     problems, _ = FolderPanoramas(own_root, erp, inputs=["rgb", "depth"]).check()
     found = {Path(p.file).parent.name: f"{p.finding}. {p.remedy}" for p in problems.listed()}
     assert found.keys() == {"scene_1", "scene_2", "scene_3"}
     assert found["scene_1"].startswith("colors; expected values of classes")
     assert found["scene_2"].startswith("another suffix; expected one image of each name")
     assert re.match(r"no such file; .*data\.inputs=\[rgb\]", found["scene_3"])
+    assert problems.warnings == [f"{own_root}/labels: 1 without an image, e.g. scene_9/stray"]
 
 
 # Names
