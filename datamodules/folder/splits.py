@@ -33,7 +33,8 @@ def divide_images(
         images: All images of the data set.
         problems: Collects invalid lines of lists.
         fractions: Share of the scenes to draw for the test: at least one, at most all but one; 1
-            for all. The same of the training scenes for validation; 0 for no validation, even with a list.
+            for all. The same of the training scenes for validation; 0 for no validation, even with
+            a list.
         seed: Seed of the draw.
 
     Raises:

@@ -179,9 +179,9 @@ def _of_common(
     has = [changed.get(one.name, one.name) for one in common if one.name in names]
     lacks = [one.name for one in common if one.name not in names]
     if len(lacks) > len(has):
-        return [f"Of the common settings: {_listed(has)}."] if has else ["No common settings."]
+        return [f"Of the common settings only {_listed(has)}." if has else "No common settings."]
     notes = [f"Other defaults: {_listed(changed.values())}."] if changed else []
-    return [*notes, f"Without {_listed(lacks)}."] if lacks else notes
+    return [*notes, f"Common settings except {_listed(lacks)}."] if lacks else notes
 
 
 def _own_bases(file: Path) -> list[Path]:
