@@ -131,11 +131,12 @@ def boundary_sums(
 
     Args:
         prediction: ``(H, W)`` labels.
-        truth: ``(H, W)`` labels; 0 is unknown and not counted.
+        truth: ``(H, W)`` labels; 0 is unknown: not counted, and another label beside a class.
         num_classes: K + 1, the unknown class 0 included.
     """
     height, width = truth.shape
     angles, known = equirect_solid_angles((height, width)), truth > 0
+    prediction = np.where(known, prediction, truth)
     near_true, near_predicted = near_boundary(truth) & known, near_boundary(prediction) & known
     both = near_true & near_predicted & (truth == prediction)
     sums = []

@@ -122,3 +122,15 @@ def test_photos_have_no_such_scores() -> None:
     assert not {"seam_step", "pole_gap", "boundary_miou"} & (scores.keys() | intervals.keys())
     scores, _ = _scores([(crops * 1.0, crops * 1.0)], DistanceHead(depth_kind="metric_distance"))
     assert "seam_step" not in scores
+
+
+def test_labels_of_unknown_pixels_do_not_count() -> None:
+    truth = _stripes(48, 96)
+    truth[10:20, 30:50] = 0
+    predictions = [np.roll(truth, 2, axis=1), np.roll(truth, 2, axis=1)]
+    for label, prediction in enumerate(predictions, start=1):
+        prediction[truth == 0] = label
+        prediction[(prediction == 0) & (truth > 0)] = 1
+    first, second = (_scores([(prediction, truth)])[0] for prediction in predictions)
+    assert first == second
+    assert first["boundary_miou"] < 1
