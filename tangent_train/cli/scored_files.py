@@ -21,7 +21,7 @@ from tangent_train.callbacks.pictures import Pictures
 from tangent_train.cli.run import Run, build_data, build_head
 from tangent_train.config.settings import EvaluateSettings, refuse_typed
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted, width_height
+from tangent_train.errors import DataError, SettingError, counted, listed, width_height
 from tangent_train.geometry.sphere import check_area
 from tangent_train.heads.pictures import evenly_spread
 from tangent_train.io.gpano import read_area
@@ -84,13 +84,14 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
             if found is not None:
                 for group in data.groups(scored.items[index]):
                     groups[group].append(len(scored.done))
-                truth, prediction = map(torch.from_numpy, found)
-                comparable = head.comparable(prediction, head.truth(truth))
-                metric.update(comparable, head.truth(truth))
+                labels, prediction = map(torch.from_numpy, found)
+                truth = head.truth(labels)
+                comparable = head.comparable(prediction, truth)
+                metric.update(comparable, truth)
                 for name, of_variant in variants.items() if place in compared else ():
                     other = mistakes.get(name, torch.clone)(prediction)
-                    of_variant.update(head.comparable(other, head.truth(truth)), head.truth(truth))
-                pictures.draw(task, data.dataset("test"), index, None, truth, comparable)
+                    of_variant.update(head.comparable(other, truth), truth)
+                pictures.draw(task, data.dataset("test"), index, None, labels, comparable)
                 scored.done.append(index)
             yield
 
@@ -98,7 +99,7 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     scored.print_problems()
     if not scored.done:
         raise DataError(
-            settings.predictions,
+            predictions,
             found=f"no usable prediction for {counted(len(scored.items), data.noun)}",
             expected=f"files named as the images, such as {scored.items[0].name}.png",
             remedy="Or give files=, a CSV file with the columns image and prediction.",
@@ -144,11 +145,14 @@ def _data(settings: EvaluateSettings, rows: int | None) -> Any:
     data = build_data(settings.model_copy(update={"representation": section}))
     if not isinstance(data, PanoramaDataModule):
         raise SettingError("data", found=type(data).__name__, expected="panoramas, not photos")
-    if rows is not None:
-        return data
-    image = data.splits()["test"][0].rgb
-    area = read_area(image, read_image_size(image), check_area(data.area))
-    return _data(settings, area.full_shape[0])
+    images: Any = ()
+    with data.problems.noted():  # the data module with the size names them
+        images = () if rows else data.files()[data.test_split]
+    for files in images:
+        with data.problems.noted(files.name):
+            area = read_area(files.rgb, read_image_size(files.rgb), check_area(data.area))
+            return _data(settings, area.full_shape[0])
+    return data
 
 
 class ScoredFiles:
@@ -189,9 +193,9 @@ class ScoredFiles:
             ("unusable predictions", "", [str(error) for error in self._problems]),
         ):
             if names:
-                listed = "".join(f"\n  {name}" for name in names[:_NAMED])
+                lines = "".join(f"\n  {name}" for name in names[:_NAMED])
                 more = f"\n  … {len(names) - _NAMED} more" * (len(names) > _NAMED)
-                print_text(f"{counted(len(names), noun)}{what}:{listed}{more}", error=True)
+                print_text(f"{counted(len(names), noun)}{what}:{lines}{more}", error=True)
 
     def _folder(self) -> Path:
         """Return the folder of the files: of an output folder of this project, a part of it."""
@@ -201,17 +205,16 @@ class ScoredFiles:
 
     def _matched(self) -> tuple[dict[str, Path], list[Path]]:
         """Return the file of each image, by its name or the last part of it; and the others."""
-        folder, listed = self._folder(), self._settings.files
+        folder, table = self._folder(), self._settings.files
         files = [path for path in walk_files(folder) if path.suffix.lower() in _SUFFIXES]
         named = [(path.relative_to(folder).as_posix(), path) for path in files]
-        if listed is not None:
-            with listed.open(newline="", encoding="utf-8-sig") as lines:
+        if table is not None:
+            with table.open(newline="", encoding="utf-8-sig") as lines:
                 rows = list(csv.DictReader(lines))
             if not rows or not {"image", "prediction"} <= rows[0].keys():
                 expected = "a CSV file with the columns image and prediction"
-                raise DataError(
-                    listed, found=", ".join(rows[0]) if rows else "no row", expected=expected
-                )
+                found = ", ".join(rows[0]) if rows else "no row"
+                raise DataError(table, found=found, expected=expected)
             named = [(row["image"], folder / row["prediction"]) for row in rows]
         paths: dict[str, set[Path]] = defaultdict(set)
         for name, path in named:
@@ -219,13 +222,13 @@ class ScoredFiles:
             for key in (composed(name), stem, stem.rpartition("/")[2]):
                 paths[key].add(path)
         stems = Counter(item.rgb.stem for item in self.items)
-        found = {}
+        matched = {}
         for item in self.items:
             keys = [item.name, *[composed(item.rgb.stem)] * (stems[item.rgb.stem] == 1)]
             matches = [paths[key] for key in keys if len(paths[key]) == 1]
             if matches:
-                (found[item.name],) = matches[0]
-        return found, sorted({*files} - {*found.values()})
+                (matched[item.name],) = matches[0]
+        return matched, sorted({*files} - {*matched.values()})
 
     def _label_map(self) -> LabelMap:
         """Return the labels of the values in the files."""
@@ -243,46 +246,41 @@ class ScoredFiles:
             return label_map
         found = read_label_map(Path(values))
         if foreign := set(found.names) - set(classes):
-            listed = ", ".join(sorted(foreign)[:_NAMED])
-            expected = f"classes of {', '.join(classes)}"
+            expected = f"classes of {listed(classes)}"
             remedy = (
                 "Give a JSON file with the values of each of these as values=; or predict with "
                 "label_map=, if tangent-predict wrote the files."
             )
-            raise DataError(values, found=listed, expected=expected, remedy=remedy)
+            raise DataError(values, found=listed(sorted(foreign)), expected=expected, remedy=remedy)
         return replace(found.regrouped(classes), refuses_others=found.refuses_others)
 
     def read(self, index: int) -> tuple[int, tuple[NDArray[Any], NDArray[Any]] | None]:
         """Return the place of an image, its labels and its prediction; None if it is unusable."""
-        path, source = self._paths[self.items[index].name], self._data.dataset("test")
-        canvas = self._data.canvas
+        source = self._data.dataset("test")
         try:
-            prediction = self._read(path)
-            truth = source.labels(index) if canvas.is_whole else source.read(index).labels
-            if truth.ndim != 2:  # without the masked pixels
-                truth = source.read(index).labels
-            shapes, how = (canvas.full_shape, canvas.image_shape), self._settings.resample
-            if prediction.shape not in shapes and how is None:
-                self._problems.append(
-                    DataError(
-                        path,
-                        found=width_height(prediction.shape),
-                        expected=width_height(canvas.image_shape),
-                        remedy="Give resample=nearest to score it at this size.",
-                    )
-                )
-                return index, None
-            if prediction.shape not in shapes:
-                self._resampled.add(width_height(prediction.shape))
-                interpolation: Any = "bilinear" if how == "linear" else "nearest"
-                prediction = resize(prediction, canvas.image_shape, interpolation)
-            if prediction.shape != canvas.full_shape:
-                prediction = canvas.place(prediction)
+            prediction = self._placed(self._paths[self.items[index].name])
+            is_whole = self._data.canvas.is_whole
+            truth = source.labels(index) if is_whole else source.read(index).labels
         except DataError as error:
             self._problems.append(error)
             return index, None
         truth = truth.astype(np.int32) if truth.dtype == np.uint16 else truth
         return index, (np.array(truth), np.array(prediction))
+
+    def _placed(self, path: Path) -> NDArray[Any]:
+        """Return a prediction for the whole sphere, at the size of the labels."""
+        prediction, how, canvas = self._read(path), self._settings.resample, self._data.canvas
+        if prediction.shape not in (canvas.full_shape, canvas.image_shape):
+            size = width_height(prediction.shape)
+            if how is None:
+                remedy = "Give resample=nearest to score it at this size."
+                expected = width_height(canvas.image_shape)
+                raise DataError(path, found=size, expected=expected, remedy=remedy)
+            self._resampled.add(size)
+            interpolation: Any = "bilinear" if how == "linear" else "nearest"
+            prediction = resize(prediction, canvas.image_shape, interpolation)
+        is_placed = prediction.shape == canvas.full_shape
+        return prediction if is_placed else canvas.place(prediction)
 
     def _read(self, path: Path) -> NDArray[Any]:
         settings, label_map = self._settings, self._map

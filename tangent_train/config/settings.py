@@ -2,8 +2,8 @@
 
 A class gives Hydra the defaults (`config_name`), validates the composed settings (`validate`),
 and feeds ``--help`` and the reference page with its comments. Lines ``# --- … ---`` are headings in
-``--help``. Options of groups (``data=…``) are
-YAML files; their types are those of the class that they build.
+``--help``. Options of groups (``data=…``) are YAML files; their types are those of the class that
+they build.
 """
 
 from __future__ import annotations

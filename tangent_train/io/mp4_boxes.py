@@ -27,7 +27,7 @@ _STEREO_MODES = {0: "mono", 1: "top-bottom", 2: "left-right", 4: "right-left"}
 
 
 class SphericalBoxes(NamedTuple):
-    """What an MP4 file states.
+    """Spherical metadata in the boxes of an MP4 file.
 
     Attributes:
         mode: Stereo mode by the names of `StereoMode`, or its number; None without a box ``st3d``.
