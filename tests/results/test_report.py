@@ -13,7 +13,7 @@ import yaml  # type: ignore[import-untyped]
 from datamodules.modelnet40.shapes import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.files import write_text
-from tangent_train.heads import DistanceHead, ImageClassHead
+from tangent_train.heads import ClassesHead, DistanceHead, ImageClassHead
 from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation import EvaluationResult, load_result
 from tangent_train.results.published import (
@@ -150,11 +150,26 @@ def test_facts_in_which_runs_differ_are_columns_of_all_rows() -> None:
     }
 
 
-def test_every_published_score_has_a_protocol_and_every_protocol_its_data() -> None:
+def test_every_published_score_has_a_protocol_its_data_and_a_known_unit() -> None:
+    columns = ClassesHead.columns | DistanceHead.columns | ImageClassHead.columns
     for line in published_lines():
         assert facts(line["protocol"])["data"] == line["data"]
         assert line["source"].startswith("https://")
-        assert 0 < float(line["mean"] or 50) < 100
+        least, most = (1, 100) if columns[line["score"]].unit == "%" else (0, 1)
+        assert not line["mean"] or least < float(line["mean"]) < most
+
+
+def test_published_depth_stands_beside_the_same_range_and_alignment() -> None:
+    columns, scores = DistanceHead.columns, dict.fromkeys(DistanceHead.columns, 0.25)
+    protocol = facts("stanford2d3ds_depth_dap")
+    result = EvaluationResult("panoramas", 373, columns, scores, protocol=protocol)
+    result = replace(result, settings={"data.fold": 1})
+    (row,), _ = published_rows([result])
+    assert row.label == "DAP (paper)"
+    assert [row.score(name).mean for name in ("absrel", "delta1")] == [0.0921, 0.9135]
+    rows, notes = published_rows([replace(result, protocol=protocol | {"range": "0 to 10 m"})])
+    assert rows == []
+    assert notes[0].endswith("range: published 0 to 100 m, this run 0 to 10 m.")
 
 
 @pytest.mark.parametrize(("name", "macc", "miou"), [("P", 61.8, 45.7), ("S-FT-10", 64.0, 49.6)])
@@ -247,7 +262,7 @@ def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> N
     """Depth: no classes, no published scores of the data set, and smaller errors are better."""
     columns = DistanceHead.columns
     means = dict.fromkeys(columns, 0.25)
-    protocol = {"data": "Stanford2D3DS", "alignment": "none"}
+    protocol = {"data": "SynthRooms", "alignment": "none"}
     settings = {"name": "mine", "seed": 0, "level": 6, "data": {"fold": 1}}
     records = []
     for number, alignment in enumerate(("none", "median in distance")):
