@@ -216,7 +216,7 @@ class _Prediction:
             entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
-        return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
+        return entry | self._head.entry(predicted, is_counted)
 
     def pictures(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:
         """Yield compressed images for the report, if the predicted pixels were written.

@@ -322,6 +322,10 @@ class Head(nn.Module, ABC):
         """
         return {}
 
+    def entry(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> dict[str, Any]:
+        """Return the part of the entry of one image in the summary file, see `summarize`."""
+        return {self.summary: self.summarize(predicted, is_counted)}
+
     def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], Sequence[Sequence[str]]]:
         """Return title, header and rows of a table of the summaries of all images."""
         return "", (), ()
