@@ -109,8 +109,8 @@ class Head(nn.Module, ABC):
             the kind of output or the other setting that it needs; "" for none.
         is_metric: False for distances that are known up to a scale.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind (`source`)
-            holds the predicted pixels, from which pictures are drawn. By default, all kinds but
-            the last are written.
+            holds the predicted pixels, from which pictures are drawn. By default, it and the
+            pictures are written.
         summary: Name of the summary of an image in the summary file.
         summary_columns: Names in the summary of an image that ``summary.csv`` lists.
         unknown: Value of unknown pixels.
@@ -263,7 +263,8 @@ class Head(nn.Module, ABC):
         if foreign := set(write or ()).difference(self.suffixes):
             expected = f"{', '.join(self.suffixes)} for a network that predicts {self.source}"
             raise SettingError("write", found=", ".join(sorted(foreign)), expected=expected)
-        return list(self.suffixes)[:-1] if write is None else write
+        usual = [kind for kind in self.suffixes if kind in (self.source, *PICTURES)]
+        return usual if write is None else write
 
     @property
     def source(self) -> str:
