@@ -29,8 +29,10 @@ _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "metric_distance": "the distance along each ray in meters",
     "metric_z": "z-depth in meters",
     "canonical_inverse": "1 / z-depth in meters, times the focal length of a view in widths",
+    "relative_z": "z-depth up to a scale of each view",
     "relative_depth": "z-depth up to a scale and a shift of each view",
     "relative_disparity": "1 / z-depth up to a scale and a shift of each view",
+    "relative_points": "points up to a scale and a shift along z of each view",
 }
 
 _OF_CLASSES = {"unknown_classes", "unknown_wins", "scores"}
