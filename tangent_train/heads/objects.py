@@ -53,6 +53,9 @@ _LEAST_SR = 1e-5
 
 
 _BOX = "longitude_deg", "latitude_deg", "width_deg", "height_deg"
+OBJECT_COLUMNS = ("number", "class", "score", *_BOX, "solid_angle_sr")
+"""Names in the table of objects, see `described`."""
+
 _STEPS = 3
 """Steps in which the center of a spherical box moves from the mean direction to its middle."""
 
@@ -61,7 +64,7 @@ class Objects(NamedTuple):
     """Objects of a panorama or photo.
 
     Attributes:
-        numbers: ``(H, W)`` int32 number of the object at each pixel, from 1; 0 for none.
+        numbers: ``(H, W)`` int32 number of the object at each pixel, 0 for none; 1 is the largest.
         classes: ``(n,)`` index of the class of each object.
         scores: ``(n,)`` confidence of each object, 0 to 1: the mean of its masks by solid angle.
     """
@@ -115,9 +118,11 @@ def join_objects(
     in_groups = sparse.csr_array(of_masks, (len(total), len(group)))
     covered = (in_groups @ masks).astype(bool) @ weights
     won = solid_angles(winners, len(total), camera_matrix)
-    is_kept = (won >= _LEAST_SR) & (won >= _LEAST_SHARE * covered)
-    table = np.append(0, np.cumsum(is_kept) * is_kept).astype(np.int32)
-    return Objects(table[winners], class_of[is_kept], of_group[is_kept])
+    kept = np.flatnonzero((won >= _LEAST_SR) & (won >= _LEAST_SHARE * covered))
+    kept = kept[np.argsort(-won[kept], kind="stable")]
+    table = np.zeros(len(won) + 1, np.int32)
+    table[kept + 1] = np.arange(1, len(kept) + 1)
+    return Objects(table[winners], class_of[kept], of_group[kept])
 
 
 def _geometry(sets: Sequence[tuple[Views, Any]], shape: tuple[int, int]) -> kernels.CanvasGeometry:
@@ -221,7 +226,7 @@ def _pixel_weights(shape: tuple[int, ...], camera_matrix: Matrix) -> Floats:
 def described(
     objects: Objects, class_names: Sequence[str], camera_matrix: Matrix = None
 ) -> list[dict[str, Any]]:
-    """Return a table of objects, the largest solid angle first.
+    """Return a table of objects in the order of their numbers.
 
     A spherical box has a center and a field of view: the object's ranges of longitude and latitude
     in a frame in which the center of the box is straight ahead.
@@ -255,7 +260,7 @@ def described(
     angles = solid_angles(numbers, count, camera_matrix).tolist()
     for entry, angle in zip(entries, angles, strict=True):
         entry["solid_angle_sr"] = float(f"{angle:.4g}")
-    return sorted(entries, key=lambda entry: -entry["solid_angle_sr"])
+    return entries
 
 
 def _directions(pixels: NDArray[np.intp], shape: tuple[int, ...], camera_matrix: Matrix) -> Floats:

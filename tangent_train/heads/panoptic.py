@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import find_objects
 from torch import Tensor
 
 from models.segments import Segments
+from tangent_train.files import csv_text, write_text
 from tangent_train.heads import pictures
 from tangent_train.heads.base import PICTURES, RGB, PredictedImage
 from tangent_train.heads.classes import ClassesHead, LabelMosaic
-from tangent_train.heads.objects import described, join_objects
+from tangent_train.heads.objects import OBJECT_COLUMNS, described, join_objects
 from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tangent_train.metrics.panoptic import LABEL
-from tangent_train.rendering import Blend
 from tangent_train.rendering.representations.views import Views
 
 _BYTE = 256
@@ -37,6 +39,8 @@ class PanopticHead(ClassesHead):
         **settings: See `ClassesHead`.
     """
 
+    waits: ClassVar[bool] = True  # objects are joined while the next image is predicted
+    usual_kinds: ClassVar[Sequence[str]] = ("labels", *PICTURES)
     suffixes = MappingProxyType(
         dict.fromkeys(("panoptic", "labels", "objects"), ".png") | ClassesHead.suffixes
     )
@@ -47,9 +51,8 @@ class PanopticHead(ClassesHead):
         super().__init__(class_names, **settings)
         self.is_thing = np.isin(self.class_names, list(things))
 
-    def mosaic(self, shape: tuple[int, int], blend: Blend, **settings: Any) -> PanopticMosaic:
-        """Return a mosaic of probabilities and objects."""
-        return PanopticMosaic(self, shape, blend, **settings)
+    def _new_mosaic(self, *given: Any, **settings: Any) -> PanopticMosaic:
+        return PanopticMosaic(self, *given, **settings)
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write a panoptic map in COCO's colors, labels, 16-bit numbers of objects and pictures."""
@@ -87,12 +90,57 @@ class PanopticHead(ClassesHead):
             return painted
         return pictures.with_class_legend(painted, labels[labels > 0], self.class_names)
 
+    def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
+        """Return labels, numbers of objects, and their descriptions."""
+        labels, numbers = np.divmod(predicted.pixels, LABEL)
+        text = (
+            "{class} {number}, score {score:.2f}, {width_deg:.1f}° × {height_deg:.1f}°".format_map
+        )
+        objects = [segment for segment in predicted.facts["segments"] if "number" in segment]
+        texts = {segment["number"]: text(segment) for segment in objects}
+        return {"prediction": labels, "numbers": numbers, "objects": texts}
+
     def entry(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> dict[str, Any]:
-        """Return the shares of the classes, and a table of the objects that are not masked."""
-        codes, seen = predicted.pixels, np.unique(predicted.pixels % LABEL)
-        objects = [each for each in predicted.facts["objects"] if each["number"] in seen]
+        """Return the shares of the classes, and COCO's ``segments_info`` with the table of objects.
+
+        Segments that are masked are left out.
+        """
+        codes, of_number = predicted.pixels, {e["number"]: e for e in predicted.facts["objects"]}
+        ids, index, counts = np.unique(codes, return_inverse=True, return_counts=True)
+        boxes = find_objects(index.reshape(codes.shape) + 1)
+        segments = []
+        for code, count, (rows, columns) in zip(ids.tolist(), counts.tolist(), boxes, strict=True):
+            label, number = divmod(code, LABEL)
+            if number or (label and not self.is_thing[label]):
+                size = columns.stop - columns.start, rows.stop - rows.start
+                box = [columns.start, rows.start, *size]
+                segment = {"id": code, "category_id": label, "area": count, "bbox": box}
+                segments.append(segment | {"iscrowd": 0} | of_number.get(number, {}))
         of_classes = predicted._replace(pixels=codes // LABEL)
-        return super().entry(of_classes, is_counted) | {"objects": objects}
+        return super().entry(of_classes, is_counted) | {"segments": segments}
+
+    def write_tables(self, folder: Path, entries: Sequence[Mapping[str, Any]]) -> None:
+        """Write ``panoptic.json`` in COCO's format, and ``objects.csv``."""
+        done = [entry for entry in entries if "segments" in entry]
+        content = {
+            "images": [
+                {"id": k, "file_name": e["file"], "width": e["columns"], "height": e["rows"]}
+                for k, e in enumerate(done)
+            ],
+            "annotations": [
+                {"image_id": k, "file_name": f"{e['name']}.png", "segments_info": e["segments"]}
+                for k, e in enumerate(done)
+            ],
+            "categories": [
+                {"id": label, "name": name, "isthing": int(self.is_thing[label])}
+                for label, name in enumerate(self.class_names)
+                if label
+            ],
+        }
+        write_text(folder / "panoptic.json", json.dumps(content) + "\n")
+        objects = [{"image": e["name"], **s} for e in done for s in e["segments"] if "number" in s]
+        names = ["image", *OBJECT_COLUMNS]
+        write_text(folder / "objects.csv", csv_text(names, objects))
 
 
 class PanopticMosaic(LabelMosaic):
@@ -106,7 +154,8 @@ class PanopticMosaic(LabelMosaic):
         self, head: PanopticHead, *given: Any, camera_matrix: Any = None, **named: Any
     ) -> None:
         super().__init__(head, *given, **named)
-        self._camera_matrix, self._things = camera_matrix, head.is_thing[1:]
+        # With that of the class −1 at the end.
+        self._camera_matrix, self._things = camera_matrix, np.append(head.is_thing[1:], False)
         self._sets: list[tuple[Views, Sequence[Segments]]] = []
         self._objects: list[dict[str, Any]] = []
 
@@ -115,13 +164,14 @@ class PanopticMosaic(LabelMosaic):
         """Objects, and the share of pixels without a class."""
         return {**super().facts, "objects": self._objects}
 
-    def add_others(self, outputs: Mapping[str, Any], views: Views) -> None:
-        """Add the objects of views."""
-        self._sets.append((views, [self._chosen(segments) for segments in outputs["segments"]]))
+    def add_segments(self, segments: Sequence[Segments], views: Views) -> None:
+        """Add the objects of some views."""
+        self._sets.append((views, list(map(self._chosen, segments))))
 
     def _chosen(self, segments: Segments) -> Segments:
         """Return the objects of the classes that have objects."""
-        is_chosen = torch.from_numpy(self._things).to(segments.classes.device)[segments.classes]
+        things = torch.from_numpy(self._things).to(segments.classes.device)
+        is_chosen = things[segments.classes]
         table = torch.cat([is_chosen.new_zeros(1), is_chosen.cumsum(0) * is_chosen]).int()
         numbers = table.index_select(0, segments.numbers.flatten()).view_as(segments.numbers)
         return Segments(numbers, segments.classes[is_chosen], segments.scores[is_chosen])
