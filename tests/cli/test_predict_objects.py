@@ -104,7 +104,7 @@ def test_objects_of_a_panorama(tmp_path: Path, network: Path, predict: Predict) 
         zip(*np.unique(codes[known], return_counts=True), strict=True)
     )
     assert [c["isthing"] for c in content["categories"]] == [0, 1, 1]
-    rows = list(csv.DictReader((output / "objects.csv").open()))
+    rows = list(csv.DictReader((output / "objects.csv").read_text().splitlines()))
     assert [row["number"] for row in sorted(rows, key=lambda row: int(row["number"]))] == list(
         "12345"
     )
