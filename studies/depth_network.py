@@ -1,6 +1,6 @@
 """A depth network for photos on panoramas with known distances (``docs/results/depth.md``).
 
-``python -m studies.depth_network fast_depth.onnx --rooms room.png=room.exr --homes zind/sample_tour``
+``python -m studies.depth_network net.onnx --rooms room.png=room.exr --homes zind/sample_tour``
 takes a network that tangent-import wrote, panoramas with their distances in meters, and homes of
 ZInD, whose layouts are known above the horizon: furniture is not in a layout.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,12 +28,16 @@ from tangent_train.heads.alignment import along_rays, depth_of_output, distance_
 from tangent_train.inference.engine import Predictor, RenderedViews
 from tangent_train.inference.images import InputImage, read_panorama
 from tangent_train.inference.views import ViewSelector
-from tangent_train.io.pixel_files import read_depth_m
+from tangent_train.io.pixel_files import read_depth_m, read_rgb
 from tangent_train.metrics.depth import BANDS, DepthProtocol, depth_scores, error_sums
 from tangent_train.metrics.scores import BAND_EDGES_DEG
+from tangent_train.rendering.resampling import resize
 
 _FARTHEST_M = 100.0
 """Larger distances are invalid in some files."""
+
+_SHAPE = 512, 1024
+"""Rows and columns of all panoramas."""
 
 _MODES = "none", "scale", "grid"
 _UNALIGNED = "equirectangular image", "six cube faces"
@@ -69,7 +74,8 @@ def homes(root: Path) -> Iterator[Panorama]:
             layout = panorama.layout()
         except DataError:
             continue
-        image = read_panorama(panorama.rgb)
+        rgb = resize(read_rgb(panorama.rgb), _SHAPE, "bilinear")
+        image = read_panorama(rgb)
         distance = layout.distances(image.shape) * panorama.pose()[1]
         distance[equirect_latitudes(image.shape[0]) < 0] = np.nan
         yield Panorama("ZInD", image, torch.from_numpy(distance).float())
@@ -82,7 +88,7 @@ def view_options(loaded: LoadedNetwork, fov_deg: Sequence[float]) -> dict[str, d
         loaded: The network.
         fov_deg: Horizontal and vertical field of view of the photos of its training.
     """
-    level, size = loaded.photo_level, list(loaded.fixed_size or loaded.image_size)
+    level, size = loaded.photo_level or loaded.level, list(loaded.fixed_size or loaded.image_size)
     found: dict[str, dict[str, Any]] = {
         "equirectangular image": {"views": "erp"},
         "six cube faces": {"views": "cubemap"},
@@ -111,7 +117,7 @@ def scores(prediction: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
             row[key + name] = float(of_sphere[key])
         if name:
             bands = depth_scores(sums[BANDS])["absrel"]
-            edges = zip(BAND_EDGES_DEG[:-1], BAND_EDGES_DEG[1:], strict=True)
+            edges = pairwise(BAND_EDGES_DEG)
             for (low, high), value in zip(edges, bands, strict=True):
                 row[f"absrel, median, {low:g}° to {high:g}°"] = float(value)
     return row
@@ -155,7 +161,7 @@ def scales_of_views(
                 lengths = torch.from_numpy(views.ray_lengths())[:, None]
                 with torch.no_grad():
                     output = loaded.network(rendered.of(views)(slice(None)))
-                depth, kind = depth_of_output(output, loaded.depth_kind, lengths)
+                depth, kind = depth_of_output(output, loaded.depth_kind or "metric_z", lengths)
                 distance = distance_of(along_rays(depth, kind, lengths), kind)[:, 0]
                 true = views.render(truth[None], "nearest")[:, 0]
                 heights = np.arcsin(views.rays()[:, 2, 2])

@@ -34,7 +34,7 @@ class _Graph:
     """
 
     def __init__(self, content: bytes, *, rounded: bool = False) -> None:
-        import tflite
+        import tflite  # type: ignore[import-not-found]
 
         self._lite, self._model = tflite, tflite.Model.GetRootAsModel(content, 0)
         self._graph, self._rounded = self._model.Subgraphs(0), rounded
@@ -47,7 +47,7 @@ class _Graph:
         """Return the ONNX model."""
         for number in range(self._graph.OperatorsLength()):
             self._add(self._graph.Operators(number))
-        shapes = {"image": ["batch", 3, _SIDE, _SIDE], "depth": ["batch", 1, _SIDE, _SIDE]}
+        shapes: Any = {"image": ["batch", 3, _SIDE, _SIDE], "depth": ["batch", 1, _SIDE, _SIDE]}
         image, depth = (
             helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)
             for name, shape in shapes.items()
@@ -107,8 +107,8 @@ class _Graph:
         """Limit an activation to its 8 bits."""
         step, zero = self._step(tensor)
         assert zero == [-128], "activations begin at 0"
-        names = {"least": 0.0, "most": _LEVELS * step[0], "step": step[0]}
-        for name, value in names.items():
+        limits = {"least": 0.0, "most": _LEVELS * step[0], "step": step[0]}
+        for name, value in list(limits.items())[: 3 if self._rounded else 2]:
             array = np.array(value, np.float32)
             self._weights.append(numpy_helper.from_array(array, f"{tensor}.{name}"))
         if self._rounded:
@@ -137,7 +137,7 @@ class _Graph:
 
 def interpreted(file: Path, images: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the depth of images ``(B, 224, 224, 3)`` in steps, from the interpreter."""
-    from ai_edge_litert.interpreter import Interpreter
+    from ai_edge_litert.interpreter import Interpreter  # type: ignore[import-not-found]
 
     interpreter = Interpreter(str(file))
     interpreter.allocate_tensors()
@@ -180,11 +180,11 @@ def main() -> None:
     parser.add_argument("photos", nargs="*", type=Path)
     files = parser.parse_args()
     onnx.save(_Graph(files.tflite.read_bytes()).model(), files.onnx)
-    photos = [cv2.imread(str(photo))[..., ::-1] for photo in files.photos]
-    if photos:
+    photos: Any = [cv2.imread(str(photo)) for photo in files.photos]
+    if photos:  # BGR
         side = (_SIDE, _SIDE)
         resized = [cv2.resize(each, side, interpolation=cv2.INTER_AREA) for each in photos]
-        compare(files.tflite, np.stack(resized))
+        compare(files.tflite, np.stack(resized)[..., ::-1])
 
 
 if __name__ == "__main__":

@@ -158,7 +158,7 @@ class PinholeGrid:
 
     @property
     def camera_matrix(self) -> NDArray[np.float64]:
-        """``(3, 3)`` pinhole matrix of every image: focal lengths 1/p, 1/q, center (w−1)/2, (h−1)/2."""
+        """``(3, 3)`` pinhole matrix of every image: focal lengths 1/p, 1/q, center (w−1)/2, …."""
         y, x = ((side - 1) / 2 for side in self.size)
         return np.array([[1 / self.pitch, 0, x], [0, 1 / self.row_pitch, y], [0, 0, 1]])
 
@@ -441,7 +441,7 @@ class RingGrid(PinholeGrid):
         pitches = 2 * across / columns, 2 * down / rows
         pitch, row_pitch = (max(pitches),) * 2 if square_pixels else pitches
         axes = _upright_axes(lonlat_to_xyz(np.radians(_ring_centers(rings))))
-        kinds = {"row_pitch": row_pitch, "is_complete": is_complete}
+        kinds: Any = {"row_pitch": row_pitch, "is_complete": is_complete}
         super().__init__(axes, (rows, columns), pitch, rotation, **kinds)
         resting = self.with_rotation(None)
         check_type("valid", valid, (np.ndarray, type(None)), "an array of booleans")

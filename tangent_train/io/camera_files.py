@@ -119,7 +119,7 @@ class _CamerasJson(BaseModel):
         axes = np.stack([to_right_handed(np.transpose(view)).T for view in self.views])
         size = self.camera.height, self.camera.width
         pitch, row_pitch = (1 / self.camera.matrix[axis][axis] for axis in (0, 1))
-        kinds = {"row_pitch": row_pitch, "is_overlapping": self.overlapping}
+        kinds: Any = {"row_pitch": row_pitch, "is_overlapping": self.overlapping}
         return PinholeGrid(axes, size, pitch, **kinds)
 
 

@@ -424,7 +424,7 @@ def covering_rings(fov_deg: tuple[float, float], overlap: float) -> list[dict[st
         # edge, where they are fewest.
         latitudes = (pitch + np.linspace(-0.5, 0.5, 9) * step).clip(max=90)
         angles = np.meshgrid(np.arange(0, 180, 0.5), latitudes)
-        kinds = {"square_pixels": False, "is_complete": False}
+        kinds: Any = {"square_pixels": False, "is_complete": False}
         view = RingGrid([{"pitch": pitch, "views": 1}], fov_deg, (2, 2), **kinds)
         seen = view.insets(lonlat_to_xyz(np.radians(np.stack(angles, -1)).reshape(-1, 2)))
         half = 0.5 * (seen.reshape(9, -1) >= 0).sum(axis=1).min()
