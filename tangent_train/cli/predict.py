@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from datamodules.core.label_map import PIXEL_CLASSES
+from datamodules.folder.class_masks import mask_reader
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.config.settings import PredictSettings, check_read
@@ -25,7 +26,6 @@ from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.engine import Predictor, UpLikelihood
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.jobs import Inputs, Job, work_on
-from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
 
@@ -141,7 +141,8 @@ class _Prediction:
             print_text(f"Photos are predicted in crops of {columns} × {rows}.")
         if settings.upright == "auto":
             loaded.check_predicts(PIXEL_CLASSES, "Use upright=pose, or null.")
-        self._settings, self._head, self._masks = settings, head, Masks(settings.mask)
+        self._settings, self._head = settings, head
+        self._masks = mask_reader(settings.mask, settings.mask_classes)
         on_device = settings.device, settings.view_batch_size, settings.compile
         self._predictor = Predictor(loaded, head, views, *on_device)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
@@ -203,7 +204,7 @@ class _Prediction:
         _, pixels, facts = predicted
         is_counted = np.array(True)
         if image.area is not None:
-            is_counted = image.cut(self._masks.read(job.name, image.area)) > 0
+            is_counted = image.cut(self._masks(job.name, image.area)) > 0
             unknown = pixels.dtype.type(self._head.unknown)
             predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
         self._head.write(self.folder.files(job), predicted)
@@ -237,6 +238,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names |= {"levels", "base_level", "blend", "write", "report", "shard"}
     names |= {"view_batch_size", "compile", "device", "trust"}
     panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
+    panoramas |= {"mask_classes"} if settings.mask is not None else set()
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()

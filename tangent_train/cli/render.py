@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from datamodules.folder.class_masks import class_masks
+from datamodules.folder.class_masks import mask_reader
 from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
@@ -38,7 +38,6 @@ from tangent_train.io.camera_files import (
 )
 from tangent_train.io.gpano import eye_part, read_area, read_tags, shape_of
 from tangent_train.io.jobs import Inputs, Job, work_on
-from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_image_size, write_pixels
 from tangent_train.io.tangent_folders import (
     TangentResults,
@@ -85,13 +84,11 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         expected = "png, tif or npy with interpolation=nearest: other formats change pixels"
         raise SettingError("format", found=settings.format, expected=expected)
     cameras = _cameras(settings, 512)  # refuses views before any panorama
-    names, masks = inputs.names, Masks(None)
+    names, masks = inputs.names, mask_reader(None, None)
     if settings.colmap:  # a camera has images of one size
         rows = _most_rows(settings, inputs)
         cameras = _cameras(settings, rows)
-        masks = Masks(settings.mask)
-        if settings.mask_classes:
-            masks = class_masks(Path(str(settings.mask)), settings.mask_classes)
+        masks = mask_reader(settings.mask, settings.mask_classes)
         content = {**content, "level": _level(settings, rows)}
     rig = {f"{Path(file).stem}/": cameras.views[face] for file, face in cameras.items}
     manifest = Manifest.open(output, content)
@@ -104,7 +101,7 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
             end = f"{flat_name(job.name)}{suffix}"
             images = {output / "images" / (prefix + end): view for prefix, view in rig.items()}
             write_views(image, images, kind, progress)
-            counts = masks.read(job.name, area)
+            counts = masks(job.name, area)
             of_images = {output / "masks" / f"{p}{end}.png": view for p, view in rig.items()}
             write_views(counts, of_images, "nearest", lambda _: None)
             return

@@ -44,7 +44,7 @@ _ARRAYS = (".npy", ".npz")
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".exr", *_ARRAYS)
 _NO_CLASS = (255, 65535)
 _NAMED = 10
-_COMPARED, _NOTED = 8, 0.05
+_COMPARED, _NOTED, _AS_THEY_ARE = 8, 0.05, "as they are"
 _MISTAKES: dict[str, Callable[[Tensor], Tensor]] = {
     "mirrored left to right": lambda pixels: pixels.flip(1),
     "upside down": lambda pixels: pixels.flip(0),
@@ -74,23 +74,16 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     metric = head.build_metric()
     pictures = Pictures(folder / "panels", settings.panels)
     task = SimpleNamespace(network=None, head=head, representation=data.representation)
-    groups: dict[str, list[int]] = defaultdict(list)
-    mistakes = _MISTAKES | ({} if data.has_distances else _numberings(data.num_classes))
-    variants = {name: head.build_metric() for name in ("as they are", *mistakes)}
-    compared = evenly_spread(_COMPARED, len(scored.indices))
+    variants = Variants(head, data, len(scored.indices))
 
     def score() -> Iterator[None]:
         for place, (index, found) in enumerate(in_threads(scored.read, scored.indices)):
             if found is not None:
-                for group in data.groups(scored.items[index]):
-                    groups[group].append(len(scored.done))
                 labels, prediction = map(torch.from_numpy, found)
                 truth = head.truth(labels)
                 comparable = head.comparable(prediction, truth)
                 metric.update(comparable, truth)
-                for name, of_variant in variants.items() if place in compared else ():
-                    other = mistakes.get(name, torch.clone)(prediction)
-                    of_variant.update(head.comparable(other, truth), truth)
+                variants.update(place, prediction, truth)
                 pictures.draw(task, data.dataset("test"), index, None, labels, comparable)
                 scored.done.append(index)
             yield
@@ -105,11 +98,51 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
             remedy="Or give files=, a CSV file with the columns image and prediction.",
         )
     task.result, task.evaluated = metric.compute(), len(scored.done)
-    _warn_of_mistakes(head, variants, counted(len(compared), data.noun))
+    if warning := variants.warning():
+        print_text(f"Warning: {warning}", error=True)
     settings = settings.model_copy(update={"representation": {"erp_height": data.erp_height}})
     run = Run(folder, settings, data, task, facts=scored.facts)
     run.write_settings()
-    run.report(predictions, groups, [pictures])
+    run.report(predictions, scored.done, [pictures])
+
+
+class Variants:
+    """Scores of predictions as they are, and without each of the usual mistakes.
+
+    Args:
+        head: Head that scores the predictions.
+        data: Data module.
+        count: Number of predictions, of which a few are compared.
+    """
+
+    def __init__(self, head: Any, data: Any, count: int) -> None:
+        numberings = {} if data.has_distances else _numberings(data.num_classes)
+        self._head, self._changes = head, {_AS_THEY_ARE: torch.clone} | _MISTAKES | numberings
+        self._metrics = {name: head.build_metric() for name in self._changes}
+        self._compared = set(evenly_spread(_COMPARED, count))
+        self.images = counted(len(self._compared), data.noun)
+
+    def update(self, place: int, prediction: Tensor, truth: Tensor) -> None:
+        """Score the prediction at a place, if it is one of those that are compared."""
+        for name, change in self._changes.items() if place in self._compared else ():
+            self._metrics[name].update(self._head.comparable(change(prediction), truth), truth)
+
+    def scores(self) -> dict[str, float]:
+        """Return the main score of each variant."""
+        of_metrics = {name: metric.compute() for name, metric in self._metrics.items()}
+        main = self._head.main_score
+        return {name: self._head.scores(of).means[main] for name, of in of_metrics.items()}
+
+    def warning(self) -> str:
+        """Return a warning if a variant is better by a margin; else ""."""
+        column, scores = self._head.columns[self._head.main_score], self.scores()
+        best = min if column.better == "lower" else max
+        name = best(scores, key=lambda name: scores[name])
+        if not abs(scores[name] - scores[_AS_THEY_ARE]) > _NOTED:
+            return ""
+        found, usual = (score_text(scores[n], column.unit) for n in (name, _AS_THEY_ARE))
+        score = f"{column.text} {found} instead of {usual}"
+        return f"{name}, predictions score {score} on {self.images}."
 
 
 def _numberings(num_classes: int) -> dict[str, Callable[[Tensor], Tensor]]:
@@ -118,24 +151,6 @@ def _numberings(num_classes: int) -> dict[str, Callable[[Tensor], Tensor]]:
         "numbered from 0 (values=from_0)": lambda labels: (labels + 1) * (labels < num_classes),
         "numbered from 1 (values=from_1)": lambda labels: labels - (labels > 0).to(labels.dtype),
     }
-
-
-def _warn_of_mistakes(head: Any, variants: Mapping[str, Any], images: str) -> None:
-    """Print a warning if predictions fit much better when they are changed."""
-    column = head.columns[head.main_score]
-    scores = {
-        name: head.scores(metric.compute()).means[head.main_score]
-        for name, metric in variants.items()
-    }
-    best = min if column.better == "lower" else max
-    name = best(scores, key=lambda name: scores[name])
-    if abs(scores[name] - scores["as they are"]) > _NOTED:
-        found, usual = (score_text(scores[n], column.unit) for n in (name, "as they are"))
-        print_text(
-            f"Warning: {name}, predictions score {column.text} {found} instead of {usual} on "
-            f"{images}.",
-            error=True,
-        )
 
 
 def _data(settings: EvaluateSettings, rows: int | None) -> Any:

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
 from tangent_train.io.pixel_files import write_pixels
-from tangent_train.metrics.scores import Interval, ScoreColumn
+from tangent_train.metrics.image_sums import Sums
+from tangent_train.metrics.scores import ScoreColumn
 from tangent_train.rendering import Blend
 
 if TYPE_CHECKING:
@@ -108,8 +109,8 @@ class Head(nn.Module, ABC):
             the kind of output or the other setting that it needs; "" for none.
         is_metric: False for distances that are known up to a scale.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind (`source`)
-            holds the predicted pixels, from which pictures are drawn. By default, all kinds but
-            the last are written.
+            holds the predicted pixels, from which pictures are drawn. By default, it and the
+            pictures are written.
         summary: Name of the summary of an image in the summary file.
         summary_columns: Names in the summary of an image that ``summary.csv`` lists.
         unknown: Value of unknown pixels.
@@ -179,16 +180,13 @@ class Head(nn.Module, ABC):
             result: Value of the metric.
         """
 
-    def intervals(self, result: Any) -> Mapping[str, Interval]:
-        """Return 95 % bootstrap intervals over the images, for means that have one."""
-        return {}
+    def image_sums(self, result: Any) -> Sums:
+        """Return numbers of each image whose sums give the means; by default, none.
 
-    def scores_of(self, result: Any, places: Sequence[int]) -> Mapping[str, float]:
-        """Return scores over some of the images by name; by default, none.
+        Intervals, scores of groups and differences between evaluations follow from them.
 
         Args:
             result: Value of the metric.
-            places: Places of the images in the order of the evaluation.
         """
         return {}
 
@@ -265,7 +263,8 @@ class Head(nn.Module, ABC):
         if foreign := set(write or ()).difference(self.suffixes):
             expected = f"{', '.join(self.suffixes)} for a network that predicts {self.source}"
             raise SettingError("write", found=", ".join(sorted(foreign)), expected=expected)
-        return list(self.suffixes)[:-1] if write is None else write
+        usual = [kind for kind in self.suffixes if kind in (self.source, *PICTURES)]
+        return usual if write is None else write
 
     @property
     def source(self) -> str:

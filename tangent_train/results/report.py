@@ -65,8 +65,8 @@ class Report:
         return "Percent. " * in_percent + _LEGEND
 
     def tables(self) -> list[Table]:
-        """Return the tables of views in conditions, of means, of classes and of latitude bands."""
-        first, tables = self.first, [self._views(), self.means()]
+        """Return the tables of views, of means, on the sphere, of classes and of latitude bands."""
+        first, tables = self.first, [self._views(), self.means(), self.sphere()]
         for name, mean in first.class_means.items():
             if not name.endswith(SOLID_ANGLE):
                 title = first.columns[mean].class_title
@@ -118,6 +118,27 @@ class Report:
         notes = (common, self._legend, _LEGEND_OF_INTERVALS * has_intervals, self.compared)
         cells = list(zip(*cells_of, strict=True))
         return Table(self.title, header, cells, " ".join(filter(None, notes)), texts)
+
+    def sphere(self, condition: str | None = None) -> Table:
+        """Return the table of the scores that only panoramas have; no rows without such scores.
+
+        Args:
+            condition: Condition of the rows, of those that have one; None for all.
+        """
+        conditions = {label: cell[1] for label, cell in self.cells.items() if condition is not None}
+        rows = [row for row in self.rows if conditions.get(row.label, condition) == condition]
+        names = {
+            name: column.title
+            for name, column in self.first.columns.items()
+            if column.of_sphere and any(row.score(name).folds for row in rows)
+        }
+        cells = [
+            (row.label, *(self._cell(row, name) for name in names))
+            for row in rows
+            if any(row.score(name).folds for name in names)
+        ]
+        note = f"{self._legend} {_LEGEND_OF_INTERVALS}"
+        return Table("On the sphere", ("", *names.values()), cells, note)
 
     def _cell(self, row: RunRow, name: str, part: Part = None) -> str:
         """Return a score with its spreads, and "of 2" if it is over fewer folds than the row."""

@@ -13,7 +13,7 @@ import yaml  # type: ignore[import-untyped]
 from datamodules.modelnet40.shapes import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.files import write_text
-from tangent_train.heads import DistanceHead, ImageClassHead
+from tangent_train.heads import ClassesHead, DistanceHead, ImageClassHead
 from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation import EvaluationResult, load_result
 from tangent_train.results.published import (
@@ -60,7 +60,7 @@ def test_the_tables_show_means_spreads_and_missing_folds() -> None:
     note = report.means().note
     assert note.startswith("data Stanford2D3DS; s 7; input RGB-D; b 0; folds 1, 3; runs 4. Percent")
     classes = {"wall": "20.0 ± 14.1 (± 0.0)", "floor": "50.0 ± 0.0 (± 0.0)", "sofa": "50.0 of 1"}
-    assert [_cells(report, k)["mine"] for k in (1, 2)] == [classes] * 2
+    assert [_cells(report, k)["mine"] for k in (2, 3)] == [classes] * 2
     assert report.notes == [
         "mine: fold 2 missing; not a mean of 3 folds.",
         "a note",
@@ -103,7 +103,7 @@ def test_published_rows_stand_beside_the_same_protocol_and_level() -> None:
     published = cells["tangent images (paper)"]
     assert (published["b"], published["mAcc %"], published["mIoU %"]) == ("0", "59.1", "44.9")
     assert cells["Lee et al. (paper)"]["mIoU %"] == "–"
-    per_class = _cells(report, 1)["tangent images (paper)"]
+    per_class = _cells(report, 2)["tangent images (paper)"]
     assert (per_class["beam"], per_class["board"]) == ("30.4", "57.2")
     source = "Published scores of the same protocol: https://arxiv.org/abs/1912.09390."
     assert source in report.notes
@@ -150,11 +150,26 @@ def test_facts_in_which_runs_differ_are_columns_of_all_rows() -> None:
     }
 
 
-def test_every_published_score_has_a_protocol_and_every_protocol_its_data() -> None:
+def test_every_published_score_has_a_protocol_its_data_and_a_known_unit() -> None:
+    columns = ClassesHead.columns | DistanceHead.columns | ImageClassHead.columns
     for line in published_lines():
         assert facts(line["protocol"])["data"] == line["data"]
         assert line["source"].startswith("https://")
-        assert 0 < float(line["mean"] or 50) < 100
+        least, most = (1, 100) if columns[line["score"]].unit == "%" else (0, 1)
+        assert not line["mean"] or least < float(line["mean"]) < most
+
+
+def test_published_depth_stands_beside_the_same_range_and_alignment() -> None:
+    columns, scores = DistanceHead.columns, dict.fromkeys(DistanceHead.columns, 0.25)
+    protocol = facts("stanford2d3ds_depth_dap")
+    result = EvaluationResult("panoramas", 373, columns, scores, protocol=protocol)
+    result = replace(result, settings={"data.fold": 1})
+    (row,), _ = published_rows([result])
+    assert row.label == "DAP (paper)"
+    assert [row.score(name).mean for name in ("absrel", "delta1")] == [0.0921, 0.9135]
+    rows, notes = published_rows([replace(result, protocol=protocol | {"range": "0 to 10 m"})])
+    assert rows == []
+    assert notes[0].endswith("range: published 0 to 100 m, this run 0 to 10 m.")
 
 
 @pytest.mark.parametrize(("name", "macc", "miou"), [("P", 61.8, 45.7), ("S-FT-10", 64.0, 49.6)])
@@ -180,6 +195,24 @@ def test_a_transfer_compares_panoramas_with_photos_of_as_much_fine_tuning() -> N
     change = table.header.index("change", table.header.index("mIoU %"))
     assert [row[change] for row in table.rows] == ["–", "−16.7 %", "+33.3 %", "–"]
     assert [row.partner and row.partner.label for row in report.rows] == [None, "P", "P", None]
+
+
+def test_scores_of_the_sphere_are_columns_for_every_view() -> None:
+    """With the interval of a single run; photos and undefined scores are left out."""
+    photos = without_solid_angle(example_result([0.4, 0.8, 0.6]))
+    photos = replace(photos, scores={"miou": 0.6})
+    upright = replace(example_result([0.3] * 3), intervals={"seam_step": (-0.1, 0.2)})
+    upright = replace(upright, scores={"miou": 0.3, "seam_step": 0.05, "pole_gap": -0.2})
+    tilted = replace(upright, scores={**upright.scores, "pole_gap": None}, intervals={})
+    stages = {"P": [photos], "S": [upright], "S-erp": [tilted], "S-erp-tilted": [tilted]}
+    cells = {"S": ("S", "upright"), "S-erp": ("erp", "upright"), "S-erp-tilted": ("erp", "tilted")}
+    report = transfer_report(stages, cells)
+    table = report.sphere("upright")
+    assert table.header == ("", "mIoU near the poles, minus horizon %", "step across the seam % ↓")
+    assert table.rows == [("S", "-20.0", "5.0 [-10.0, 20.0]"), ("S-erp", "–", "5.0")]
+    assert [row[0] for row in report.sphere().rows] == ["S", "S-erp", "S-erp-tilted"]
+    assert report.sphere() in report.tables()
+    assert not transfer_report({"P": [photos]}).sphere().rows
 
 
 def test_reports_of_shapes_have_the_published_scores_of_the_same_rotation() -> None:
@@ -229,7 +262,7 @@ def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> N
     """Depth: no classes, no published scores of the data set, and smaller errors are better."""
     columns = DistanceHead.columns
     means = dict.fromkeys(columns, 0.25)
-    protocol = {"data": "Stanford2D3DS", "alignment": "none"}
+    protocol = {"data": "SynthRooms", "alignment": "none"}
     settings = {"name": "mine", "seed": 0, "level": 6, "data": {"fold": 1}}
     records = []
     for number, alignment in enumerate(("none", "median in distance")):
