@@ -314,9 +314,9 @@ class ImportSettings(Settings):
     scores: ScoreKind | None = None
     """output of the network: logits | probabilities | labels; null = recognized from its values"""
     depth: DepthKind | None = None
-    """kind of depth that the network predicts: metric_z | metric_distance | relative_depth |
-    relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface), else
-    it predicts classes"""
+    """kind of depth that the network predicts: metric_z | metric_distance | relative_z |
+    relative_depth | relative_disparity | relative_points | canonical_inverse | log_distance; null =
+    from the model (huggingface), else it predicts classes"""
     image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
     """fixed image size: [rows,columns] or the side; null = from the model"""
 
