@@ -60,7 +60,9 @@ def import_network(settings: ImportSettings) -> None:
     output, size = settings.output, settings.image_size
     suffix = ".onnx" if settings.library == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
-        raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
+        remedy = "An ONNX network stays an ONNX file." if suffix == ".onnx" else ""
+        expected = f"a name ending in {suffix}"
+        raise SettingError("output", found=output.name, expected=expected, remedy=remedy)
     check_new(output, overwrite=settings.overwrite)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
         network = _load(settings)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -215,3 +218,40 @@ def test_views_without_cameras_are_refused() -> None:
             SettingError, match="views: found views without cameras; expected a pan"
         ):
             Predictor(network, head_of(network), selector).predict(image)
+
+
+def test_the_documented_network_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The adapter of VGGT in docs/how-to/own_network.md, with a stand-in that sees the room.
+
+    Like VGGT, it returns camera-from-world in the axes of its first camera, and depth in a unit of
+    its own.
+    """
+    known: list[Tensor] = []
+
+    class StandIn(Ball):
+        def forward(self, images: Tensor, *_: Any) -> Any:
+            assert images.ndim == 5
+            depth = 5 * super().forward(images[0], *known)["out"][None]
+            pose = (known[0][:1].mT @ known[0]).mT[None]
+            return {"depth": depth[..., None], "depth_conf": depth, "pose_enc": pose}
+
+    def decoded(pose: Tensor, size: Any) -> tuple[Tensor, None]:
+        assert tuple(size) == (128, 128)
+        return torch.cat([pose, torch.zeros_like(pose[..., :1])], dim=-1), None
+
+    page = (Path(__file__).parents[2] / "docs/how-to/own_network.md").read_text()
+    code = page.partition("# my_depth.py\n")[2].partition("```")[0]
+    for name, content in (
+        ("vggt.models.vggt", {"VGGT": StandIn}),
+        ("vggt.utils.pose_enc", {"pose_encoding_to_extri_intri": decoded}),
+    ):
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
+    names: dict[str, Any] = {}
+    exec(code, names)
+    adapter = names["VggtDepth"]()
+    adapter.register_forward_pre_hook(lambda _, inputs: known.__setitem__(slice(None), inputs[1:]))
+    loaded = replace(many_view_network(adapter), depth_kind="relative_z")
+    mosaic = predicted(loaded)
+    ratio = mosaic.pixels().numpy() / true_distances()
+    np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=1e-4)
+    assert float(mosaic.facts["rotation_error_deg"]) < 1e-2
