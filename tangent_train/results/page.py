@@ -12,7 +12,6 @@ from datetime import datetime
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import cv2
@@ -58,7 +57,7 @@ class EncodedImage(NamedTuple):
             the largest first, without shares of missing maps; by solid angle for panoramas.
         scale: Scale of the distances, see `pack_distances`; None for labels.
         objects: Description of each object by its number, which is the green channel of the PNG of
-            predicted labels; empty for a gray PNG.
+            predicted labels; None for a gray PNG.
     """
 
     name: str
@@ -73,7 +72,7 @@ class EncodedImage(NamedTuple):
     confidence: bytes | None = None
     shares: Sequence[Sequence[float]] = ()
     scale: Mapping[str, Any] | None = None
-    objects: Mapping[int, str] = MappingProxyType({})
+    objects: Mapping[int, str] | None = None
 
 
 def encode_image(
@@ -85,7 +84,7 @@ def encode_image(
     truth: NDArray[Any] | None = None,
     confidence: NDArray[np.floating] | None = None,
     numbers: NDArray[np.integer] | None = None,
-    objects: Mapping[int, str] = MappingProxyType({}),
+    objects: Mapping[int, str] | None = None,
     is_metric: bool = True,
     camera_matrix: NDArray[np.float64] | None = None,
     sphere: bool = True,

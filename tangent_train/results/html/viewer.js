@@ -256,7 +256,7 @@ class Viewer {
     const bytes = this.surface.valueAt(kind, at);
     if (!bytes) return null;
     if (kind === "confidence") return `${kind}: ${Math.round(bytes[0] / 2.55)} %`;
-    const object = kind === "prediction" && this.data.objects[bytes[1]];
+    const object = kind === "prediction" && this.data.objects?.[bytes[1]];
     if (object) return `${nameOf(kind)}: ${object}`;
     if (!this.distances) return `${nameOf(kind)}: ${this.classes[bytes[0]]?.name ?? bytes[0]}`;
     const log = this.distances.log(bytes[0], bytes[1]);
