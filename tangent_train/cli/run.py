@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning
+import numpy as np
 import yaml  # type: ignore[import-untyped]
 from hydra.utils import get_class
 from lightning.pytorch.callbacks import (
@@ -134,14 +135,12 @@ class Run:
         if getattr(data, "upright", None) == "auto" and head.kind == PIXEL_CLASSES:
             data.estimate_up(UpLikelihood(self.as_loaded(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=data, verbose=False)
-        items, groups = data.splits()["test"], defaultdict(list)
+        items = data.splits()["test"]
         # Without test batches, `task.result` is that of a validation.
         tested = self.task.evaluated if sum(trainer.num_test_batches) else 0
         if tested == len(items):
-            for place, index in enumerate(gathered_order(tested, trainer.world_size)):
-                for group in data.groups(items[index]):
-                    groups[group].append(place)
-            self.report(checkpoint, groups, trainer.callbacks)  # type: ignore[attr-defined]
+            order = gathered_order(tested, trainer.world_size)
+            self.report(checkpoint, order, trainer.callbacks)  # type: ignore[attr-defined]
             return
         text = f"{tested} of {len(items)} test {data.noun} were evaluated: no results are written."
         rank_zero_only(print_text)(text)
@@ -170,21 +169,26 @@ class Run:
         )
 
     @rank_zero_only
-    def report(
-        self, checkpoint: Path, groups: Mapping[str, list[int]], callbacks: Sequence[Callback]
-    ) -> None:
-        """Write the results, with the scores of each group of images (`DataModule.groups`)."""
+    def report(self, checkpoint: Path, order: Sequence[int], callbacks: Sequence[Callback]) -> None:
+        """Write the results, with the scores of each group of images (`DataModule.groups`).
+
+        Args:
+            checkpoint: File of the network's weights, or of predictions.
+            order: Index of each image of the test split, in the order of the evaluation.
+            callbacks: Callbacks, of which `Pictures` have pictures for the report.
+        """
         head, data, task = self.task.head, self.data, self.task
+        items, groups = [data.splits()["test"][index] for index in sorted(order)], defaultdict(list)
+        for place, files in enumerate(items):
+            for group in data.groups(files):
+                groups[group].append(place)
+        sums = head.image_sums(task.result)
+        sums = {name: values[np.argsort(order)] for name, values in sums.items()}
         # A relative path stays right when the folder is moved.
         is_inside = checkpoint.is_relative_to(self.folder)
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         result = replace(
-            evaluation.evaluation_result(head, task.result, data.noun, task.evaluated),
-            groups=[
-                {"group": group, "images": len(places)}
-                | evaluation.plain_scores(head.scores_of(task.result, places))
-                for group, places in sorted(groups.items())
-            ],
+            evaluation.evaluation_result(head, task.result, data.noun, len(items), sums, groups),
             protocol={**data.facts, **head.facts, **self.facts},
             checkpoint=name,
             label_map=self.settings.model_dump(mode="json").get("label_map"),
@@ -196,6 +200,7 @@ class Run:
         summary, (rows, sources) = evaluation.summary_lines(result), published_rows([result])
         published = [published_table(rows, result)] if rows else []
         evaluation.write_results(result, self.folder, [*notes, *sources], published)
+        evaluation.write_image_sums(self.folder, [files.name for files in items], sums)
         network = source if task.network is None else type(self.as_loaded().module).__name__
         images = [i for c in callbacks if isinstance(c, Pictures) for i in c.images]
         shown = [f"Shown: {len(images)} of {result.images} {data.noun}, the worst first."]

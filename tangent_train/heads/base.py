@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
 from tangent_train.io.pixel_files import write_pixels
-from tangent_train.metrics.scores import Interval, ScoreColumn
+from tangent_train.metrics.image_sums import Sums
+from tangent_train.metrics.scores import ScoreColumn
 from tangent_train.rendering import Blend
 
 if TYPE_CHECKING:
@@ -179,16 +180,13 @@ class Head(nn.Module, ABC):
             result: Value of the metric.
         """
 
-    def intervals(self, result: Any) -> Mapping[str, Interval]:
-        """Return 95 % bootstrap intervals over the images, for means that have one."""
-        return {}
+    def image_sums(self, result: Any) -> Sums:
+        """Return numbers of each image whose sums give the means; by default, none.
 
-    def scores_of(self, result: Any, places: Sequence[int]) -> Mapping[str, float]:
-        """Return scores over some of the images by name; by default, none.
+        Intervals, scores of groups and differences between evaluations follow from them.
 
         Args:
             result: Value of the metric.
-            places: Places of the images in the order of the evaluation.
         """
         return {}
 

@@ -29,11 +29,10 @@ from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth
 from tangent_train.io.point_clouds import write_points
 from tangent_train.kinds import Align, DepthKind
 from tangent_train.metrics import depth as metrics
+from tangent_train.metrics.image_sums import Sums, as_sums, means_of_sums
 from tangent_train.metrics.scores import (
-    Interval,
     ScoreColumn,
     by_solid_angle,
-    defined_mean,
     sphere_columns,
     with_solid_angle,
 )
@@ -209,24 +208,17 @@ class DistanceHead(Head):
         Args:
             result: Sums ``(images, 13, 10)``, see `error_sums`.
         """
-        pixels, angles = (metrics.mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
-        if not result[:, 1].any():
-            return Scores(pixels)
         bands = map(metrics.mean_depth_scores, result[:, metrics.BANDS].swapaxes(0, 1))
-        of_sphere = metrics.sphere_scores(result[:, metrics.SPHERE])
-        means = {name: float(defined_mean(values)) for name, values in of_sphere.items()}
-        return Scores(pixels | by_solid_angle(angles) | means, bands=list(bands))
+        means = means_of_sums(self.image_sums(result))
+        return Scores(means, bands=list(bands) if result[:, 1].any() else ())
 
-    def intervals(self, result: NDArray[np.float64]) -> dict[str, Interval]:
-        """Return intervals of the means."""
+    def image_sums(self, result: NDArray[np.float64]) -> Sums:
+        """Return the scores of each image."""
         pixels, angles = (metrics.depth_scores(result[:, weighting]) for weighting in (0, 1))
+        if not result[:, 1].any():
+            return as_sums(pixels)
         of_sphere = metrics.sphere_scores(result[:, metrics.SPHERE])
-        return metrics.depth_intervals(pixels | by_solid_angle(angles) | of_sphere)
-
-    def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
-        """Return means over some images; NaN if they have no known distances."""
-        undefined = dict.fromkeys(self.scores(result).means, np.nan)
-        return undefined | dict(self.scores(result[list(places)]).means)
+        return as_sums(pixels | by_solid_angle(angles) | of_sphere)
 
     @property
     def facts(self) -> dict[str, str]:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Integer
+from jaxtyping import Integer
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
-from tangent_train.metrics.scores import BAND_EDGES_DEG, band_of_rows, defined_mean
+from tangent_train.metrics.image_sums import AbsentClass, class_scores, mean_scores
+from tangent_train.metrics.scores import BAND_EDGES_DEG, band_of_rows
 from tangent_train.metrics.sphere import (
     REGIONS,
     SEAM_SUMS,
@@ -21,9 +22,6 @@ from tangent_train.metrics.sphere import (
     near_boundary,
     row_weights,
 )
-
-AbsentClass = Literal["skip", "zero"]
-"""Treatment of a class without labeled pixels: left out of means, or counted as 0."""
 
 _COUNTS_AT_ONCE = 2**22
 """Counts of rows of a panorama that are held at once, 32 MiB."""
@@ -64,34 +62,13 @@ def segmentation_scores(
     sums = np.stack(_class_sums(np.asarray(confusion, np.float64)))
     means = {name: float(score) for name, score in mean_scores(sums, absent_class).items()}
     share = sums[0] / max(sums[0].sum(), 1e-300)
-    return SegmentationScores(means, _class_scores(sums, absent_class), share)
+    return SegmentationScores(means, class_scores(sums, absent_class), share)
 
 
 def _class_sums(confusion: Any) -> tuple[Any, Any, Any]:
     """Return labeled pixels, predicted pixels and hits of each class (array or tensor)."""
     known = confusion[1:]
     return known.sum(1), known[:, 1:].sum(0), known[:, 1:].diagonal()
-
-
-def _class_scores(
-    sums: NDArray[np.float64], absent_class: AbsentClass
-) -> dict[str, NDArray[np.float64]]:
-    """Return IoU and accuracy ``(..., K)``, given the sums ``(..., 3, K)``."""
-    truth, predicted, hits = np.moveaxis(sums, -2, 0)
-    missing = np.nan if absent_class == "skip" else 0.0
-    areas = {"iou": truth + predicted - hits, "accuracy": truth}
-    return {
-        name: np.where(truth > 0, hits / np.maximum(area, 1e-300), missing)
-        for name, area in areas.items()
-    }
-
-
-def mean_scores(
-    sums: Float[np.ndarray, "*some 3 classes"], absent_class: AbsentClass = "skip"
-) -> dict[str, NDArray[np.float64]]:
-    """Return mIoU and mAcc, given labeled area, predicted area and hits of each class."""
-    scores = _class_scores(sums, absent_class)
-    return {"miou": defined_mean(scores["iou"]), "macc": defined_mean(scores["accuracy"])}
 
 
 class SegmentationCounts(NamedTuple):
