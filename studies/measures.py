@@ -14,7 +14,7 @@ import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.datamodule import RoomSettings, SynthRooms
+from datamodules.synthrooms.datamodule import RoomSettings, SynthRooms, generate_rooms
 from studies.output import Row, save
 from tangent_train.geometry import equirect_shape
 from tangent_train.heads import ClassesHead, DistanceHead
@@ -47,7 +47,7 @@ def closed_forms(level: int = 9) -> list[Row]:
     in_caps, in_strip = abs(latitudes_deg) > 90 - CAP_DEG, longitudes_deg < STRIP_DEG - 180
     found: list[Row] = []
     for name, prediction, truth in (
-        ("the truth", middle, middle),
+        ("the ground truth", middle, middle),
         ("class 1 everywhere", np.ones_like(middle), middle),
         ("shifted by half the width", 3 - middle, middle),
         (f"class 1 within {CAP_DEG}° of the poles", np.where(in_caps, 1, middle), middle),
@@ -75,8 +75,8 @@ def picture(height: int = 512) -> Figure:
     settings = RoomSettings(seed=3, rooms={"1": 1, "5a": 1, "5b": 0}, height=height, supersample=1)
     views = EquirectRepresentation(level=0, erp_height=height)
     with tempfile.TemporaryDirectory() as folder:
+        generate_rooms(Path(folder), settings, workers=1)
         data = SynthRooms(Path(folder), views, rooms=settings)
-        data.make_files()
         image = data.dataset("train").read(0)
     labels: Any = image.labels
     colors = class_colors(data.class_names)[labels]
