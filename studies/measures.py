@@ -54,8 +54,8 @@ def closed_forms(level: int = 9) -> list[Row]:
         (f"class 1 in {STRIP_DEG}° east of the seam", np.where(in_strip, 1, middle), middle),
         (f"a boundary off by {OFF_DEG}°", shifted, north),
     ):
-        head = ClassesHead(("unknown", "1", "2"))
-        found.append({"prediction": name, **_scores(head, prediction, truth)})
+        classes = ClassesHead(("unknown", "1", "2"))
+        found.append({"prediction": name, **_scores(classes, prediction, truth)})
     growing = np.exp2((columns + 0.5) / width)
     head = DistanceHead(depth_kind="metric_distance")
     step = _scores(head, growing, np.ones_like(growing))["seam_step"]
