@@ -277,6 +277,7 @@ def build_head(settings: RunSettings, data: Any, depth_kind: str | None = None) 
 
 def build_task(settings: RunSettings, data: Any, network: nn.Module, head: Any) -> Any:
     """Build the task of a run."""
+    optimizer = build_from_config(settings.optimizer, "optimizer")  # the schedule has its rate
     scheduler = None
     if settings.scheduler is not None:
         section = dict(settings.scheduler)
@@ -288,7 +289,7 @@ def build_task(settings: RunSettings, data: Any, network: nn.Module, head: Any) 
         network=network,
         representation=data.representation,
         head=head,
-        optimizer=build_from_config(settings.optimizer, "optimizer"),
+        optimizer=optimizer,
         scheduler=scheduler,
     )
 

@@ -27,7 +27,7 @@ from tangent_train.heads.classes import exact
 from tangent_train.io.exr import check_exr, write_exr
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
 from tangent_train.io.point_clouds import write_points
-from tangent_train.kinds import Align, DepthKind
+from tangent_train.kinds import Align, DepthKind, depth_channels
 from tangent_train.metrics import depth as metrics
 from tangent_train.metrics.image_sums import Sums, as_sums, means_of_sums
 from tangent_train.metrics.scores import (
@@ -62,6 +62,7 @@ _ROWS = {
     "step_before": "median step between views before alignment, %",
     "step_after": "median step between views after alignment, %",
     "isolated": "views without overlap",
+    "rotation_error_deg": "error of the network's own rotations, °",
 }
 """Rows of the table, by name in the summary; shares are in percent."""
 
@@ -169,7 +170,8 @@ class DistanceHead(Head):
     ) -> Float[Tensor, "images height width"]:
         """Return the errors of the logarithm of the network's depth, or disparity.
 
-        Relative outputs are first scaled and shifted, see `scaled_and_shifted`.
+        Relative outputs are first scaled and shifted, see `scaled_and_shifted`; `relative_z` is
+        only scaled, to a mean error of 0.
 
         Args:
             outputs: Outputs of the network.
@@ -178,9 +180,12 @@ class DistanceHead(Head):
         values = outputs[:, 0].to(targets.dtype)  # float32 in half-precision training
         if self.depth_kind == "log_distance":
             return values - targets
-        if not self.is_metric:
+        if not self.is_metric and self.depth_kind != "relative_z":
             values = metrics.scaled_and_shifted(values, targets)
-        return values.clamp(min=_LEAST).log() - targets.log()
+        errors = values.clamp(min=_LEAST).log() - targets.log()
+        if self.depth_kind == "relative_z":
+            errors = errors - errors.nanmean(dim=(-2, -1), keepdim=True)
+        return errors
 
     def loss_norm(self, targets: Tensor) -> Tensor:
         """Return the number of pixels whose distance is known."""
@@ -259,7 +264,8 @@ class DistanceHead(Head):
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
         """Return distances along the rays of single crops."""
         lengths = ray_lengths[:, None]
-        values, kind = views.depth_of_output(outputs, self.depth_kind, lengths)
+        depth = outputs[:, : depth_channels(self.depth_kind)]  # without confidence
+        values, kind = views.depth_of_output(depth, self.depth_kind, lengths)
         return views.distance_of(views.along_rays(values, kind, lengths), kind)[:, 0]
 
     # Pictures and files

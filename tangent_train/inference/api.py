@@ -417,7 +417,7 @@ def apply(
     step = images_per_call or views_per_forward(grid.size)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     shape, views = (rows, columns), PinholeViews(grid)
-    panorama = reduce_to_pitch(panorama, grid.pitch)
+    panorama = reduce_to_pitch(panorama, min(grid.pitches))
     kept: list[NDArray[Any]] = []
     mosaic: Any = None
     for faces in np.split(np.arange(grid.num_images), range(step, grid.num_images, step)):
