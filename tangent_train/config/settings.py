@@ -328,6 +328,9 @@ class ImportSettings(Settings):
     unknown_wins: bool = True
     """pixels whose best class is one of unknown_classes: true = unknown (label 0) | false = the
     best other class"""
+    things: OneOrMore[str] = ()
+    """classes of which the network also returns objects, e.g. [chair,table], or all; for universal
+    networks of huggingface"""
 
     # --- photos and views ---
     normalization: str | dict[str, tuple[float, ...]] | None = None

@@ -12,9 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.inputs import Normalization
-from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
+from models.huggingface import (
+    DEPTH,
+    SEGMENTATION,
+    architecture,
+    image_processor_class,
+    network_types,
+)
 from tangent_train.config.from_file import build_from_file
-from tangent_train.errors import DataError, SettingError, first_line
+from tangent_train.errors import DataError, SettingError, first_line, listed
 from tangent_train.files import read_json
 from tangent_train.imports import hide_output, offline
 from tangent_train.kinds import DepthKind
@@ -28,7 +34,7 @@ from tangent_train.photo_networks.network import (
 )
 
 _NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
-_TASK = "the task is semantic"
+_TASK = "the task is "
 _LEFT_OUT = ("use_auxiliary_head", "use_fov_model")
 """Parts of networks that are not used: a head for training, and the field of view of Depth Pro,
 which is known here."""
@@ -65,6 +71,9 @@ _NOT_OF_COLORS = ("do_resize", "do_center_crop", "do_pad", "do_split_image")
 _MOST_PIXELS = 2**26
 """Largest image size of an image processor that is tried."""
 
+_ALL = "all"
+"""Setting `things`: all classes have objects."""
+
 _LISTED = 4
 """Largest number of wrong tensors in a message."""
 
@@ -74,6 +83,7 @@ def load(
     classes: Path | None = None,
     normalization: Any = None,
     depth: DepthKind | None = None,
+    things: Sequence[str] = (),
 ) -> PhotoNetwork:
     """Load a network of transformers for semantic or universal segmentation, or for depth.
 
@@ -84,10 +94,12 @@ def load(
         classes: JSON file of the class names; None for the names in the model's config.
         normalization: See `Normalization.of`; None for that of the model's image processor.
         depth: Kind of depth; None for that of the model's config.
+        things: Names of the classes of which a universal network also returns objects; or "all".
 
     Raises:
         DataError: A file is missing, or cannot be fetched or used.
-        SettingError: The kind of depth is unknown, or transformers is not installed.
+        SettingError: There are no such classes, or no objects; the kind of depth is unknown; or
+            transformers is not installed.
     """
     folder = saved_folder(model)
     path = folder / "config.json"
@@ -97,7 +109,7 @@ def load(
         processor = _processor(folder, described["model_type"])
         settings = {"config": described, "bgr": processor["do_flip_channel_order"]}
         kind: DepthKind | None = None
-        names: tuple[str, ...] = ()
+        given_names: tuple[str, ...] = ()
         if _predicts_depth(config, path, depth):
             kind = declared_kind(config, path, depth)
             padded = described["model_type"] == _PADDED and bool(processor.get("do_pad"))
@@ -107,8 +119,12 @@ def load(
             labels = {index: str(name).strip() for index, name in labels.items()}
             names = names_of(labels, path, _NAMES)
             settings |= {"_target_": "models.HuggingFaceNetwork", "num_classes": len(names)}
+        given_names = names if classes is None else class_names_in(classes)
+        if things:
+            things = given_names if list(things) == [_ALL] else things
+            settings["things"] = _indices(things, given_names, described["model_type"])
         if described["model_type"] == "oneformer":
-            settings["task"] = _task(folder, config)
+            settings["task"] = _task(folder, config, "panoptic" if things else "semantic")
         network = build_from_file(settings, "network", path)
         _load_tensors(network, tensors_in(folder), folder)
     settings["config"] = architecture(network.network.config.to_dict())
@@ -116,12 +132,22 @@ def load(
     return PhotoNetwork(
         module=network,
         settings=settings,
-        score_names=names if classes is None else class_names_in(classes),
+        score_names=given_names,
         normalization=given or Normalization(processor["mean"], processor["std"]),
         image_size=_image_size(processor, folder / "preprocessor_config.json"),
         score_kind="logits",
         depth_kind=kind,
+        things=things,
     )
+
+
+def _indices(things: Sequence[str], names: Sequence[str], model_type: str) -> list[int]:
+    """Return the indices of classes that have objects."""
+    is_universal = model_type in network_types(SEGMENTATION[1])
+    if not (is_universal and set(things) <= set(names)):
+        expected = f"among {listed(names)}" if is_universal else f"null, for {model_type}"
+        raise SettingError("things", found=listed(things), expected=expected)
+    return [names.index(name) for name in things]
 
 
 def _predicts_depth(config: Mapping[str, Any], path: Path, depth: DepthKind | None) -> bool:
@@ -209,15 +235,14 @@ def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[A
 def _processor_class(content: Mapping[str, Any], model_type: str) -> Any:
     """Return the class named in a file, also by its older name, or the network's default."""
     import transformers  # loads its classes on demand
-    from transformers import IMAGE_PROCESSOR_MAPPING, AutoConfig
+    from transformers import AutoConfig
     from transformers.image_processing_utils import BaseImageProcessor
 
     older = str(content.get("feature_extractor_type", "")).replace("Feature", "Image")
     name = str(content.get("image_processor_type") or older.replace("Extractor", "Processor"))
     kind = getattr(transformers, name.removesuffix("Fast"), None)
     if not (isinstance(kind, type) and issubclass(kind, BaseImageProcessor)):
-        kinds: Any = IMAGE_PROCESSOR_MAPPING[type(AutoConfig.for_model(model_type))]
-        kind = kinds.get("torchvision") or kinds["pil"]
+        kind = image_processor_class(AutoConfig.for_model(model_type))
     return kind
 
 
@@ -236,8 +261,8 @@ def _image_size(processor: Mapping[str, Any], path: Path) -> tuple[int, int]:
     return size
 
 
-def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
-    """Return the tokens that select OneFormer's semantic task (``OneFormerProcessor``)."""
+def _task(folder: Path, config: Mapping[str, Any], task: str) -> list[int]:
+    """Return the tokens that select one of OneFormer's tasks (``OneFormerProcessor``)."""
     from transformers import AutoTokenizer
 
     if not any((folder / name).is_file() for name in _VOCABULARIES):  # else tokens are "unknown"
@@ -247,7 +272,7 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
         folder, local_files_only=True, trust_remote_code=False
     )
     length = config.get("task_seq_len", 77)
-    text = tokenizer(_TASK, padding="max_length", max_length=length, truncation=True)
+    text = tokenizer(_TASK + task, padding="max_length", max_length=length, truncation=True)
     masked = zip(text["input_ids"], text["attention_mask"], strict=True)
     return [token * mask for token, mask in masked]
 

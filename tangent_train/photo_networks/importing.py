@@ -89,6 +89,9 @@ def import_network(
     """
     multiple, only_size = declared_sizes(network.module)
     fixed = image_size or only_size
+    if network.things and fixed and fixed[0] != fixed[1]:
+        found = f"{width_height(fixed)}, and objects"
+        raise SettingError("image_size", found=found, expected="a square, which views are")
     size = fixed or network.image_size
     output = _output(network, size)
     described: dict[str, Any] = {"class_names": (), "predicts": DISTANCE}
