@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.inputs import Normalization
+from datamodules.core.label_map import UNKNOWN_NAME
 from models.huggingface import (
     DEPTH,
     SEGMENTATION,
@@ -19,6 +22,7 @@ from models.huggingface import (
     image_processor_class,
     network_types,
 )
+from models.prompted import text_network, without_layers, without_text
 from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError, first_line, listed
 from tangent_train.files import read_json
@@ -32,6 +36,9 @@ from tangent_train.photo_networks.network import (
     saved_folder,
     tensors_in,
 )
+
+Prompts = Mapping[str, Sequence[str]] | Sequence[str] | None
+"""Texts that name classes, see `prompted`."""
 
 _NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
 _TASK = "the task is "
@@ -84,6 +91,8 @@ def load(
     normalization: Any = None,
     depth: DepthKind | None = None,
     things: Sequence[str] = (),
+    prompts: Prompts = None,
+    threshold: float = 0.5,
 ) -> PhotoNetwork:
     """Load a network of transformers for semantic or universal segmentation, or for depth.
 
@@ -95,6 +104,8 @@ def load(
         normalization: See `Normalization.of`; None for that of the model's image processor.
         depth: Kind of depth; None for that of the model's config.
         things: Names of the classes of which a universal network also returns objects; or "all".
+        prompts: See `prompted`.
+        threshold: See `prompted`.
 
     Raises:
         DataError: A file is missing, or cannot be fetched or used.
@@ -104,12 +115,14 @@ def load(
     folder = saved_folder(model)
     path = folder / "config.json"
     config = read_json(path, "the config of a model")
+    if prompts is not None:
+        return prompted(folder, config, prompts, threshold, normalization)
     with offline():
         described = architecture(config | dict.fromkeys(_LEFT_OUT, False))
         processor = _processor(folder, described["model_type"])
         settings = {"config": described, "bgr": processor["do_flip_channel_order"]}
         kind: DepthKind | None = None
-        given_names: tuple[str, ...] = ()
+        names: tuple[str, ...] = ()
         if _predicts_depth(config, path, depth):
             kind = declared_kind(config, path, depth)
             padded = described["model_type"] == _PADDED and bool(processor.get("do_pad"))
@@ -139,6 +152,82 @@ def load(
         depth_kind=kind,
         things=things,
     )
+
+
+def prompted(
+    folder: Path, config: Any, prompts: Prompts, threshold: float, normalization: Any
+) -> PhotoNetwork:
+    """Load a network that finds what a text names, with the texts as classes.
+
+    Args:
+        folder: Folder of the model with its tokenizer.
+        config: Content of its config.
+        prompts: Texts, which are the names of the classes; texts of each class by its name; or a
+            file with a text per line.
+        threshold: Probability that a class must exceed; elsewhere pixels are unknown.
+        normalization: See `load`.
+    """
+    if not isinstance(prompts, Mapping):
+        names = tuple(prompts or ())
+        if len(names) == 1 and Path(names[0]).is_file():
+            lines = Path(names[0]).read_text(encoding="utf-8").splitlines()
+            names = tuple(filter(None, map(str.strip, lines)))
+        prompts = {name: [name] for name in names}
+    names, texts = tuple(prompts), list(prompts.values())
+    config = config.get("detector_config") or config  # SAM 3 is published with its tracker
+    with offline():
+        described = architecture(config)
+        processor = _processor(folder, described["model_type"])
+        whole = text_network(described).eval()
+        _load_tensors(SimpleNamespace(network=whole), tensors_in(folder), folder)
+        embeddings, is_token = _embedded(whole, folder, [text for of in texts for text in of])
+        settings = {
+            "_target_": "models.PromptedNetwork",
+            "config": without_layers(described),
+            "class_of_prompt": [k for k, of in enumerate(texts) for _ in of],
+            "num_tokens": is_token.shape[1],
+            "threshold": threshold,
+        }
+        network: Any = build_from_file(settings, "network", folder / "config.json")
+    network.network.load_state_dict(without_text(whole).state_dict())
+    network.embeddings.copy_(embeddings)
+    network.is_token.copy_(is_token)
+    given = None if normalization is None else Normalization.of(normalization, 3)
+    return PhotoNetwork(
+        module=network,
+        settings=settings,
+        score_names=(*names, UNKNOWN_NAME),
+        normalization=given or Normalization(processor["mean"], processor["std"]),
+        image_size=network.fixed_size,
+        score_kind="logits",
+        things=names if described["model_type"] == "sam3" else (),
+        unknown=(UNKNOWN_NAME,),
+    )
+
+
+@torch.no_grad()
+def _embedded(whole: Any, folder: Path, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Return the embeddings of texts, and which of their tokens are not padding."""
+    if not texts:
+        raise SettingError("prompts", found="none", expected="a text for each class")
+    tokenizer = _tokenizer(folder, "a text")
+    length = whole.config.text_config.max_position_embeddings
+    how = {"padding": "max_length", "max_length": length, "truncation": True}
+    tokens = tokenizer(list(texts), return_tensors="pt", **how)
+    given = {name: tokens[name] for name in ("input_ids", "attention_mask")}
+    if whole.config.model_type == "clipseg":
+        return whole.get_conditional_embeddings(len(texts), **given), torch.ones(len(texts), 0) > 0
+    return whole.get_text_features(**given).pooler_output, tokens["attention_mask"] > 0
+
+
+def _tokenizer(folder: Path, reason: str) -> Any:
+    """Return the tokenizer of a model."""
+    from transformers import AutoTokenizer
+
+    if not any((folder / name).is_file() for name in _VOCABULARIES):  # else tokens are "unknown"
+        expected = f"the tokenizer of the network, which takes {reason}"
+        raise DataError(folder, found=f"no {' or '.join(_VOCABULARIES)}", expected=expected)
+    return AutoTokenizer.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
 
 
 def _indices(things: Sequence[str], names: Sequence[str], model_type: str) -> list[int]:
@@ -263,14 +352,7 @@ def _image_size(processor: Mapping[str, Any], path: Path) -> tuple[int, int]:
 
 def _task(folder: Path, config: Mapping[str, Any], task: str) -> list[int]:
     """Return the tokens that select one of OneFormer's tasks (``OneFormerProcessor``)."""
-    from transformers import AutoTokenizer
-
-    if not any((folder / name).is_file() for name in _VOCABULARIES):  # else tokens are "unknown"
-        expected = "the tokenizer of OneFormer, which takes its task as text"
-        raise DataError(folder, found=f"no {' or '.join(_VOCABULARIES)}", expected=expected)
-    tokenizer = AutoTokenizer.from_pretrained(
-        folder, local_files_only=True, trust_remote_code=False
-    )
+    tokenizer = _tokenizer(folder, "its task as text")
     length = config.get("task_seq_len", 77)
     text = tokenizer(_TASK + task, padding="max_length", max_length=length, truncation=True)
     masked = zip(text["input_ids"], text["attention_mask"], strict=True)

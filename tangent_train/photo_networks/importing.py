@@ -98,7 +98,8 @@ def import_network(
     if network.depth_kind is None:
         kind = score_kind or network.score_kind or usual_kind(output, len(network.score_names))
         count = output.shape[1]
-        names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
+        unknown = {*unknown_classes, *network.unknown}
+        names, groups = _groups(network.score_names, kind, count, unknown, unknown_wins)
         things = tuple(name for name in map(composed, network.things) if name in names)
         described = {"class_names": names, "groups": groups, "score_kind": kind, "things": things}
     # A network of a fixed size gets square images of its longer side, see `NetworkDescription`.
