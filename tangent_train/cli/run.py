@@ -201,14 +201,15 @@ class Run:
         shown = [f"Shown: {len(images)} of {result.images} {data.noun}, the worst first."]
         write_report(
             self.folder / "report.html",
-            f"{network} on {type(data).__name__} ({checkpoint.name})",
+            f"{network} on {data.facts['data']} ({checkpoint.name})",
             tables=[*tables, *([evaluation.confusion_table(result)] if result.confusion else [])],
             images=images,
             class_names=head.class_names,
             notes=[*summary, *notes, *shown * bool(images)],
         )
         print_text("\n".join([*self.notes, *summary]))
-        tables[0].print()
+        for table in tables[:2]:
+            table.print()
         print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
 

@@ -104,7 +104,7 @@ class DistanceHead(Head):
             "delta3": ScoreColumn("δ3", is_main=False),
             "missing": ScoreColumn("missing", better="lower", is_main=False),
         }
-    ) | sphere_columns("AbsRel", "", better="lower")
+    ) | sphere_columns("AbsRel", "", better="lower", distance="median change of distance")
     main_score: ClassVar[str] = "absrel"
     predict_settings = MappingProxyType(
         {"align": "", "depth_format": "depth", "depth_scale": "depth", "points": "points"}
@@ -225,6 +225,14 @@ class DistanceHead(Head):
         """Return means over some images; NaN if they have no known distances."""
         undefined = dict.fromkeys(self.scores(result).means, np.nan)
         return undefined | dict(self.scores(result[list(places)]).means)
+
+    def agreement(self, first: PredictedImage, other: PredictedImage) -> dict[str, float]:
+        """Return the median of ``|d' / d − 1|``; d' is aligned with d as it is with the truth."""
+        before, after = (torch.from_numpy(image.pixels).double() for image in (first, other))
+        changes = (self.comparable(after, before) / before - 1).abs().numpy()
+        angles = np.array(first.solid_angles)
+        middle = np.nanquantile(changes, 0.5, weights=angles, method="inverted_cdf")
+        return {"distance": float(middle)}
 
     @property
     def facts(self) -> dict[str, str]:

@@ -18,6 +18,7 @@ from pydantic import TypeAdapter
 
 from tangent_train.errors import DataError, counted, listed
 from tangent_train.files import csv_text, read_json, write_text
+from tangent_train.metrics.depth import depth_intervals
 from tangent_train.metrics.scores import BAND_EDGES_DEG, SOLID_ANGLE, Interval, ScoreColumn
 from tangent_train.results.tables import Table, markdown_text, score_text
 
@@ -125,10 +126,15 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
 
     Args:
         head: Head that the scores come from.
-        result: Value of its metric.
+        result: Value of its metric; None if only the consistency was measured.
         noun: Plural name of the images: panoramas, photos, shapes.
         images: Number of images.
     """
+    consistency = plain_scores({name: np.nanmean(v) for name, v in head.consistency.items()})
+    intervals = depth_intervals(head.consistency) if consistency else {}
+    if result is None:
+        columns = {name: head.columns[name] for name in consistency}
+        return EvaluationResult(noun, images, columns, consistency, intervals=intervals)
     means, of_classes, bands, confusion = head.scores(result)
     scores = list(zip(*(values.tolist() for values in of_classes.values()), strict=True))
     names = head.class_names[len(head.class_names) - len(scores) :]  # without the unknown class
@@ -137,7 +143,7 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
         noun,
         images,
         head.columns,
-        {**plain_scores(means), **{name: None for name in head.columns if name not in means}},
+        {**plain_scores(means), **{n: None for n in head.columns if n not in means}, **consistency},
         classes=[
             {"class": name} | plain_scores(dict(zip(of_classes, values, strict=True)))
             for name, values in zip(names, scores, strict=True)
@@ -147,7 +153,7 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
             for (north, south), band in zip(edges, bands, strict=False)
         ],
         confusion=() if confusion is None else confusion.tolist(),
-        intervals=head.intervals(result),
+        intervals={**head.intervals(result), **intervals},
     )
 
 
@@ -233,13 +239,7 @@ def result_tables(result: EvaluationResult) -> list[Table]:
         result: The evaluation.
     """
     tables = [_per_class(result) if result.classes else _over_all(result)]
-    of_sphere = [
-        [column.title, _mean(result, name)]
-        for name, column in result.columns.items()
-        if column.of_sphere and result.scores.get(name) is not None
-    ]
-    if of_sphere:
-        tables.append(Table("On the sphere", ("score", f"over all {result.noun}"), of_sphere))
+    tables.append(_over_all(result, "On the sphere", of_sphere=True))
     bands = [
         {"latitude": "{}° … {}°".format(*band["latitude_deg"]), **band}
         for band in result.latitude_bands
@@ -256,7 +256,7 @@ def result_tables(result: EvaluationResult) -> list[Table]:
                 for entry in entries
             ]
             tables.append(Table(title, [*firsts, *(c.title for c in columns.values())], rows))
-    return tables
+    return [table for table in tables if table.rows]
 
 
 def _mean(result: EvaluationResult, name: str) -> str:
@@ -265,17 +265,19 @@ def _mean(result: EvaluationResult, name: str) -> str:
 
 
 def _is_shown(result: EvaluationResult, name: str) -> bool:
-    """Return False for a score by solid angle of photos."""
+    """Return False for a score by solid angle of photos, and for one that was not measured."""
+    if name in result.columns and result.columns[name].of_sphere:
+        return result.scores.get(name) is not None
     return bool(result.latitude_bands) or not name.endswith(SOLID_ANGLE)
 
 
-def _over_all(result: EvaluationResult) -> Table:
+def _over_all(result: EvaluationResult, title: str = "Scores", *, of_sphere: bool = False) -> Table:
     rows = [
         [column.title, _mean(result, name)]
         for name, column in result.columns.items()
-        if _is_shown(result, name) and not column.of_sphere
+        if column.of_sphere == of_sphere and _is_shown(result, name)
     ]
-    return Table("Scores", ("score", f"over all {result.noun}"), rows)
+    return Table(title, ("score", f"over all {result.noun}"), rows)
 
 
 def _per_class(result: EvaluationResult) -> Table:
