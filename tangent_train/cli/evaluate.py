@@ -18,7 +18,7 @@ from tangent_train.cli.run import Run, build_data, build_head, build_task
 from tangent_train.cli.scored_files import OF_FILES, score_files
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import EvaluateSettings, refuse_typed
-from tangent_train.errors import SettingError, listed
+from tangent_train.errors import SettingError, check_choice, listed
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage, read_panorama
@@ -68,7 +68,7 @@ def evaluate(settings: EvaluateSettings) -> None:
         check_size(loaded, data.representation.image_size)
     head = build_head(settings, data, loaded.depth_kind)
     if settings.consistency or settings.input is not None:
-        head.consistency = rank_zero_only(_consistency)(settings, loaded, head, data) or {}
+        head.consistency = rank_zero_only(_rotated)(settings, loaded, head, data) or {}
     task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
     rank_zero_only(run.write_settings)()
@@ -82,19 +82,15 @@ def evaluate(settings: EvaluateSettings) -> None:
 def _unlabeled(settings: EvaluateSettings, loaded: LoadedNetwork) -> Any:
     """Return what takes the place of a data set for panoramas without labels."""
     representation = build_from_config(settings.representation or {}, "representation")
-    facts, names = {"data": str(settings.input)}, loaded.class_names
-    what: dict[str, Any] = {"noun": "panoramas", "facts": facts, "class_names": names, "folds": ()}
-    return SimpleNamespace(**what, representation=representation)
+    noun = "panoramas" + " without depth" * ("depth" in loaded.inputs)
+    what: dict[str, Any] = {"noun": noun, "facts": {"data": str(settings.input)}, "folds": ()}
+    names = loaded.class_names
+    return SimpleNamespace(**what, class_names=names, representation=representation)
 
 
-def _consistency(
-    settings: EvaluateSettings, loaded: LoadedNetwork, head: Any, data: Any
-) -> dict[str, Any]:
+def _rotated(settings: EvaluateSettings, loaded: LoadedNetwork, head: Any, data: Any) -> Any:
     """Return the scores of `Predictor.consistency` of all panoramas, arrays by name."""
-    lacks_depth = settings.input is not None and "depth" in loaded.inputs
-    if data.noun != "panoramas" or lacks_depth or not settings.consistency:
-        expected = "0 for photos; with input= a larger number, and a network that takes no depth"
-        raise SettingError("consistency", found=settings.consistency, expected=expected)
+    check_choice("data, with consistency=", data.noun, ("panoramas",))
     if settings.input is None:
         source = data.dataset("test")
         count, read = len(source), map(source.read, range(len(source)))
@@ -106,7 +102,7 @@ def _consistency(
     views, rng = ViewSelector(loaded), np.random.default_rng(settings.seed)
     views.representation = data.representation
     predictor, found = Predictor(loaded, head, views, "auto"), list[dict[str, float]]()
-    scores = (predictor.consistency(image, settings.consistency, rng) for image in images)
+    scores = (predictor.consistency(i, settings.consistency or 8, rng) for i in images)
     show_progress(map(found.append, scores), "Rotating", "panoramas", count)
     return {name: np.array([of_image[name] for of_image in found]) for name in found[0]}
 

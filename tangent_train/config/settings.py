@@ -485,7 +485,7 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     # --- consistency ---
     consistency: NonNegativeInt = 0
     """panoramas: compare predictions for this number of turns about the vertical, and for as many
-    random rotations, with the first prediction; 0 = none"""
+    random rotations, with the first prediction; 0 = none (8 with input=)"""
     input: str | Path | None = None
     """only consistency, of panoramas without labels, instead of data=: panorama or video, folder of
     them, or pattern, e.g. 'holiday/*.jpg'"""

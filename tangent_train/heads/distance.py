@@ -231,8 +231,7 @@ class DistanceHead(Head):
         before, after = (torch.from_numpy(image.pixels).double() for image in (first, other))
         changes = (self.comparable(after, before) / before - 1).abs().numpy()
         angles = np.array(first.solid_angles)
-        middle = np.nanquantile(changes, 0.5, weights=angles, method="inverted_cdf")
-        return {"distance": float(middle)}
+        return {"distance": np.nanquantile(changes, 0.5, weights=angles, method="inverted_cdf")}
 
     @property
     def facts(self) -> dict[str, str]:

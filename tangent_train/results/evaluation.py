@@ -133,7 +133,7 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
     consistency = plain_scores({name: np.nanmean(v) for name, v in head.consistency.items()})
     intervals = depth_intervals(head.consistency) if consistency else {}
     if result is None:
-        columns = {name: head.columns[name] for name in consistency}
+        columns = {name: replace(head.columns[name], is_main=True) for name in consistency}
         return EvaluationResult(noun, images, columns, consistency, intervals=intervals)
     means, of_classes, bands, confusion = head.scores(result)
     scores = list(zip(*(values.tolist() for values in of_classes.values()), strict=True))
@@ -265,9 +265,7 @@ def _mean(result: EvaluationResult, name: str) -> str:
 
 
 def _is_shown(result: EvaluationResult, name: str) -> bool:
-    """Return False for a score by solid angle of photos, and for one that was not measured."""
-    if name in result.columns and result.columns[name].of_sphere:
-        return result.scores.get(name) is not None
+    """Return False for a score by solid angle of photos."""
     return bool(result.latitude_bands) or not name.endswith(SOLID_ANGLE)
 
 
@@ -275,7 +273,7 @@ def _over_all(result: EvaluationResult, title: str = "Scores", *, of_sphere: boo
     rows = [
         [column.title, _mean(result, name)]
         for name, column in result.columns.items()
-        if column.of_sphere == of_sphere and _is_shown(result, name)
+        if column.of_sphere == of_sphere and result.scores.get(name) is not None
     ]
     return Table(title, ("score", f"over all {result.noun}"), rows)
 

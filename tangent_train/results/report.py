@@ -123,11 +123,9 @@ class Report:
         """Return the table of the scores that only panoramas have, in the first condition."""
         first = next(iter(self.cells.values()), ("", ""))
         rows = [row for row in self.rows if self.cells.get(row.label, first)[1] == first[1]]
-        parts: dict[str, tuple[str, Part]] = {
-            column.title: (name, None)
-            for name, column in self.first.columns.items()
-            if column.of_sphere and any(row.score(name).folds for row in rows)
-        }
+        columns = {name: c for name, c in self.first.columns.items() if c.of_sphere}
+        scored = [name for name in columns if any(row.score(name).folds for row in rows)]
+        parts = {columns[name].title: (name, None) for name in scored}
         return replace(self, rows=rows)._parts(f"On the sphere {first[1]}".strip(), parts)
 
     def print(self) -> None:

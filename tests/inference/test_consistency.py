@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from datamodules.core.inputs import RGB_NORMALIZATION, Normalization
+from datamodules.core.inputs import RGB_NORMALIZATION
 from tangent_train.geometry import random_rotation
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.inference.engine import Predictor
@@ -112,9 +112,8 @@ def test_pixels_outside_a_partial_panorama_and_the_tilt_do_not_count() -> None:
 
 @pytest.mark.parametrize("views", [TANGENT, ERP])
 def test_the_elevation_of_pixels_is_that_of_the_rotated_panorama(views: dict[str, Any]) -> None:
-    normalization = Normalization((*RGB_NORMALIZATION.mean, 0), (*RGB_NORMALIZATION.std, 1))
-    network: dict[str, Any] = {"module": Above(), "normalization": normalization}
-    found = _consistency(InputImage(sphere(64)), views, 5, inputs=("rgb", "elevation"), **network)
+    network: dict[str, Any] = {"module": Above(), "inputs": ("rgb", "elevation")}
+    found = _consistency(InputImage(sphere(64)), views, 5, **network)
     assert found["consistency_labels_yaw"] > 0.98
     assert found["consistency_labels_so3"] == pytest.approx(1 - np.mean(_tilts(5)), abs=0.02)
 
