@@ -30,10 +30,12 @@ DepthKind = Literal[
     "metric_distance",
     "metric_z",
     "canonical_inverse",
+    "relative_z",
     "relative_depth",
     "relative_disparity",
+    "relative_points",
 ]
-"""Output of a depth network, a channel of values at the pixels of its images.
+"""Output of a depth network at the pixels of its images, a channel of values or three.
 
 * `log_distance`: natural logarithm of the distance along the ray in meters; trained with
   `DistanceHead`.
@@ -41,8 +43,16 @@ DepthKind = Literal[
 * `metric_z`: z-depth in meters, the distance times the cosine of the angle to the optical axis.
 * `canonical_inverse`: 1 / z-depth, in meters if the focal length were the width of the image, as of
   Depth Pro; z-depth is proportional to the focal length.
+* `relative_z`: z-depth up to a scale per image.
 * `relative_depth`: z-depth up to a scale and a shift per image.
 * `relative_disparity`: 1 / z-depth up to a scale and a shift per image.
+* `relative_points`: points (x to the right, y down, z ahead) up to a scale and a shift of z per
+  image, as of MoGe; three channels, first or last.
 
 In views that are not pinhole images (equirectangular images, icospheres), z-depth is the distance.
 """
+
+
+def depth_channels(kind: DepthKind) -> int:
+    """Return the number of channels of the output of a depth network."""
+    return 3 if kind == "relative_points" else 1

@@ -2,15 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.core.label_map import read_label_map
 from tangent_train.errors import SettingError
 from tangent_train.io import image_files
-from tangent_train.io.masks import Masks
+from tangent_train.io.gpano import PanoramaArea
+from tangent_train.io.masks import Mask, Masks
+
+
+def mask_reader(
+    masks: Sequence[Mask] | None, ignored: Sequence[str] | None
+) -> Callable[[str, PanoramaArea], NDArray[np.uint8]]:
+    """Return a function that reads where a panorama counts in all of several masks.
+
+    It has the arguments of `Masks.read`, and returns 255 where all masks count, else 0.
+
+    Args:
+        masks: See `Mask`.
+        ignored: Names of classes; folders are then those of `class_masks`. None for plain masks.
+
+    Raises:
+        DataError: A mask is missing or cannot be used.
+        SettingError: There is no such latitude or class.
+    """
+    each = [
+        class_masks(mask, ignored)
+        if ignored and isinstance(mask, Path) and mask.is_dir()
+        else Masks(mask)
+        for mask in masks or [None]
+    ]
+    return lambda name, area: np.minimum.reduce([mask.read(name, area) for mask in each])
 
 
 def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:

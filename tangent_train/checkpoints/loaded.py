@@ -26,7 +26,7 @@ from tangent_train.config.from_file import build_from_file, without_weights
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
 from tangent_train.files import checked_file, load_plain
 from tangent_train.io.gpano import Fill
-from tangent_train.kinds import DepthKind, ScoreKind
+from tangent_train.kinds import DepthKind, ScoreKind, depth_channels
 
 METADATA_KEY = "tangent_train"
 """Key of the description of a network: in a checkpoint, in the ``metadata_props`` of an ONNX file
@@ -69,6 +69,7 @@ class NetworkDescription:
             trained on; None for other networks.
         groups: Indices of a photo network's scores for each class, and in a last group those of no
             class: where they win, the label is 0. None if each score is a class.
+        things: Names of the classes of which the network returns objects, see `Segments`.
         score_kind: Kind of the output of a network of classes.
         depth_kind: Kind of the output of a depth network; None for networks of classes.
         fill: Colors outside the area of partial panoramas in the training.
@@ -87,6 +88,7 @@ class NetworkDescription:
     fixed_size: _Size | None = None
     photo_level: int | None = None
     groups: tuple[tuple[int, ...], ...] | None = None
+    things: tuple[str, ...] = ()
     score_kind: ScoreKind = "logits"
     depth_kind: DepthKind | None = None
     fill: Fill = "mean"
@@ -157,11 +159,12 @@ class LoadedNetwork(NetworkDescription):
         """Network that returns scores of K classes ``(B, K, h, w)``, or depth ``(B, 1, h, w)``.
 
         With `groups`, a further score is that of no class. Images are ``(B, C, h, w)`` float32,
-        normalized.
+        normalized. See `OutputNetwork` for further inputs and outputs.
         """
         tile = None if self.is_spherical else self.fixed_size
         if self.predicts == DISTANCE and self.depth_kind is not None:
-            return OutputNetwork(self.module, 1, tile=tile, kind=None).eval()
+            channels = depth_channels(self.depth_kind)
+            return OutputNetwork(self.module, channels, tile=tile, kind=None).eval()
         if self.predicts != PIXEL_CLASSES:
             return self.module
         count = len(self.class_names) - 1

@@ -75,35 +75,37 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.input is None:
         run.test(run.trainer(), checkpoint)
     else:
-        task.result, task.evaluated = None, len(next(iter(head.consistency.values())))
-        run.report(checkpoint, {}, ())
+        task.result = None
+        run.report(checkpoint, range(len(data.splits()["test"])), ())
 
 
 def _unlabeled(settings: EvaluateSettings, loaded: LoadedNetwork) -> Any:
     """Return what takes the place of a data set for panoramas without labels."""
     representation = build_from_config(settings.representation or {}, "representation")
-    noun = "panoramas" + " without depth" * ("depth" in loaded.inputs)
-    what: dict[str, Any] = {"noun": noun, "facts": {"data": str(settings.input)}, "folds": ()}
-    names = loaded.class_names
-    return SimpleNamespace(**what, class_names=names, representation=representation)
+    inputs = Inputs.find(str(settings.input))
+    jobs = list(inputs.jobs(inputs.names))
+    return SimpleNamespace(
+        noun="panoramas" + " without depth" * ("depth" in loaded.inputs),
+        splits=lambda: {"test": jobs}, groups=lambda _: (), folds=(),
+        facts={"data": str(settings.input)}, class_names=loaded.class_names,
+        representation=representation,
+    )  # fmt: skip
 
 
 def _rotated(settings: EvaluateSettings, loaded: LoadedNetwork, head: Any, data: Any) -> Any:
     """Return the scores of `Predictor.consistency` of all panoramas, arrays by name."""
     check_choice("data, with consistency=", data.noun, ("panoramas",))
+    items = data.splits()["test"]
     if settings.input is None:
-        source = data.dataset("test")
-        count, read = len(source), map(source.read, range(len(source)))
+        read = map(data.dataset("test").read, range(len(items)))
         images = (InputImage(i.rgb, i.depth, i.up, area=data.canvas) for i in read)
     else:
-        inputs = Inputs.find(settings.input)
-        count, jobs = len(inputs.names), inputs.jobs(inputs.names)
-        images = (read_panorama(job.value or job.path) for job in jobs)
+        images = (read_panorama(job.value or job.path) for job in items)
     views, rng = ViewSelector(loaded), np.random.default_rng(settings.seed)
     views.representation = data.representation
     predictor, found = Predictor(loaded, head, views, "auto"), list[dict[str, float]]()
     scores = (predictor.consistency(i, settings.consistency or 8, rng) for i in images)
-    show_progress(map(found.append, scores), "Rotating", "panoramas", count)
+    show_progress(map(found.append, scores), "Rotating", "panoramas", len(items))
     return {name: np.array([of_image[name] for of_image in found]) for name in found[0]}
 
 

@@ -29,8 +29,10 @@ _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "metric_distance": "the distance along each ray in meters",
     "metric_z": "z-depth in meters",
     "canonical_inverse": "1 / z-depth in meters, times the focal length of a view in widths",
+    "relative_z": "z-depth up to a scale of each view",
     "relative_depth": "z-depth up to a scale and a shift of each view",
     "relative_disparity": "1 / z-depth up to a scale and a shift of each view",
+    "relative_points": "points up to a scale and a shift along z of each view",
 }
 
 _OF_CLASSES = {"unknown_classes", "unknown_wins", "scores"}
@@ -58,7 +60,9 @@ def import_network(settings: ImportSettings) -> None:
     output, size = settings.output, settings.image_size
     suffix = ".onnx" if settings.library == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
-        raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
+        remedy = "An ONNX network stays an ONNX file." if suffix == ".onnx" else ""
+        expected = f"a name ending in {suffix}"
+        raise SettingError("output", found=output.name, expected=expected, remedy=remedy)
     check_new(output, overwrite=settings.overwrite)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
         network = _load(settings)

@@ -15,6 +15,7 @@ from functools import partial
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 from tangent_train.errors import DataError, SettingError, printable
@@ -49,6 +50,22 @@ def _errors_as_messages(command: str) -> Iterator[None]:
         sys.exit(130)
 
 
+@contextmanager
+def _unused_folder_removed(command: str) -> Iterator[None]:
+    """Remove the run folder of a refused command, if it has only Hydra's files and the log."""
+    from hydra.core.hydra_config import HydraConfig
+
+    try:
+        yield
+    except (DataError, SettingError):
+        config = HydraConfig.get()
+        folder = Path(config.runtime.output_dir)
+        names = {path.name for path in folder.iterdir()} - {f"{command}.log"}
+        if names == {".hydra"} and "run.dir=" not in str(config.overrides.hydra):
+            rmtree(folder)
+        raise
+
+
 def _run(command: str, settings: Any) -> Any:
     """Run a command; runs have a log file."""
     from hydra.core.hydra_config import HydraConfig
@@ -78,7 +95,8 @@ def _main(command: str) -> None:
         missing = missing_groups(command)
         if in_sweep() and not missing:  # outside the block: the other jobs go on
             return run_job(command)
-        with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions
+        # Inside: Hydra prints a line for other exceptions.
+        with _errors_as_messages(command), _unused_folder_removed(command):
             refuse_typed(OF_SWEEPS, f"a sweep: tangent-{command} -m …")
             settings = validate(command, config, missing)
             import_module("tangent_train.cli.paths").check_paths(settings)

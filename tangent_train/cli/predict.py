@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, suppress
 from functools import partial
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from datamodules.core.label_map import PIXEL_CLASSES
+from datamodules.folder.class_masks import mask_reader
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.config.settings import PredictSettings, check_read
@@ -25,7 +26,6 @@ from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.engine import Predictor, UpLikelihood
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.jobs import Inputs, Job, work_on
-from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
 
@@ -76,7 +76,8 @@ def predict(settings: PredictSettings) -> None:
         shown = [n for n in names if n in manifest.finished]
         shown = [shown[k] for k in evenly_spread(settings.report, len(shown))]
         if shown:
-            folder.write_page(entries, list(prediction.pictures(inputs, shown)))
+            finished = {name: manifest.finished[name] for name in shown}
+            folder.write_page(entries, list(prediction.pictures(inputs, finished)))
         folder.table(entries).print()
         if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
             count = counted(len(spoiled), "images")
@@ -141,7 +142,8 @@ class _Prediction:
             print_text(f"Photos are predicted in crops of {columns} × {rows}.")
         if settings.upright == "auto":
             loaded.check_predicts(PIXEL_CLASSES, "Use upright=pose, or null.")
-        self._settings, self._head, self._masks = settings, head, Masks(settings.mask)
+        self._settings, self._head = settings, head
+        self._masks = mask_reader(settings.mask, settings.mask_classes)
         on_device = settings.device, settings.view_batch_size, settings.compile
         self._predictor = Predictor(loaded, head, views, *on_device)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
@@ -203,7 +205,7 @@ class _Prediction:
         _, pixels, facts = predicted
         is_counted = np.array(True)
         if image.area is not None:
-            is_counted = image.cut(self._masks.read(job.name, image.area)) > 0
+            is_counted = image.cut(self._masks(job.name, image.area)) > 0
             unknown = pixels.dtype.type(self._head.unknown)
             predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
         self._head.write(self.folder.files(job), predicted)
@@ -215,18 +217,19 @@ class _Prediction:
             entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
-        return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
+        return entry | self._head.entry(predicted, is_counted)
 
-    def pictures(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:
+    def pictures(self, inputs: Inputs, entries: Mapping[str, Any]) -> Iterator[Any]:
         """Yield compressed images for the report, if the predicted pixels were written.
 
         The least confident are first. Only images that this call has predicted have a confidence.
         """
         means = {name: found.mean() for name, found in self._confidences.items()}
-        for job in sorted(inputs.jobs(names), key=lambda job: means.get(job.name, 1)):
+        for job in sorted(inputs.jobs(entries), key=lambda job: means.get(job.name, 1)):
             file = self.folder.files(job).get(self._head.source)
             if file is not None:
-                predicted = PredictedImage(self.read(job), self._head.read(file))
+                facts = entries[job.name]
+                predicted = PredictedImage(self.read(job), self._head.read(file), facts)
                 confidence = self._confidences.get(job.name)
                 yield encode_prediction(self._head, job.name, predicted, confidence)
 
@@ -237,6 +240,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names |= {"levels", "base_level", "blend", "write", "report", "shard"}
     names |= {"view_batch_size", "compile", "device", "trust"}
     panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
+    panoramas |= {"mask_classes"} if settings.mask is not None else set()
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()

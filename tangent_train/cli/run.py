@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning
+import numpy as np
 import yaml  # type: ignore[import-untyped]
 from hydra.utils import get_class
 from lightning.pytorch.callbacks import (
@@ -44,6 +45,7 @@ from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.inference.engine import UpLikelihood
+from tangent_train.metrics.image_sums import as_sums
 from tangent_train.results import evaluation
 from tangent_train.results.page import write_report
 from tangent_train.results.published import published_rows, published_table
@@ -134,14 +136,12 @@ class Run:
         if getattr(data, "upright", None) == "auto" and head.kind == PIXEL_CLASSES:
             data.estimate_up(UpLikelihood(self.as_loaded(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=data, verbose=False)
-        items, groups = data.splits()["test"], defaultdict(list)
+        items = data.splits()["test"]
         # Without test batches, `task.result` is that of a validation.
         tested = self.task.evaluated if sum(trainer.num_test_batches) else 0
         if tested == len(items):
-            for place, index in enumerate(gathered_order(tested, trainer.world_size)):
-                for group in data.groups(items[index]):
-                    groups[group].append(place)
-            self.report(checkpoint, groups, trainer.callbacks)  # type: ignore[attr-defined]
+            order = gathered_order(tested, trainer.world_size)
+            self.report(checkpoint, order, trainer.callbacks)  # type: ignore[attr-defined]
             return
         text = f"{tested} of {len(items)} test {data.noun} were evaluated: no results are written."
         rank_zero_only(print_text)(text)
@@ -170,21 +170,27 @@ class Run:
         )
 
     @rank_zero_only
-    def report(
-        self, checkpoint: Path, groups: Mapping[str, list[int]], callbacks: Sequence[Callback]
-    ) -> None:
-        """Write the results, with the scores of each group of images (`DataModule.groups`)."""
+    def report(self, checkpoint: Path, order: Sequence[int], callbacks: Sequence[Callback]) -> None:
+        """Write the results, with the scores of each group of images (`DataModule.groups`).
+
+        Args:
+            checkpoint: File of the network's weights, or of predictions.
+            order: Index of each image of the test split, in the order of the evaluation.
+            callbacks: Callbacks, of which `Pictures` have pictures for the report.
+        """
         head, data, task = self.task.head, self.data, self.task
+        items, groups = [data.splits()["test"][index] for index in sorted(order)], defaultdict(list)
+        for place, files in enumerate(items):
+            for group in data.groups(files):
+                groups[group].append(place)
+        sums = {} if task.result is None else head.image_sums(task.result)
+        sums = {name: values[np.argsort(order)] for name, values in sums.items()}
+        sums |= as_sums(head.consistency)
         # A relative path stays right when the folder is moved.
         is_inside = checkpoint.is_relative_to(self.folder)
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         result = replace(
-            evaluation.evaluation_result(head, task.result, data.noun, task.evaluated),
-            groups=[
-                {"group": group, "images": len(places)}
-                | evaluation.plain_scores(head.scores_of(task.result, places))
-                for group, places in sorted(groups.items())
-            ],
+            evaluation.evaluation_result(head, task.result, data.noun, len(items), sums, groups),
             protocol={**data.facts, **head.facts, **self.facts},
             checkpoint=name,
             label_map=self.settings.model_dump(mode="json").get("label_map"),
@@ -195,6 +201,7 @@ class Run:
         notes, tables = [f"{source}: {name}", *self.notes], evaluation.result_tables(result)
         summary, (rows, sources) = evaluation.summary_lines(result), published_rows([result])
         published = [published_table(rows, result)] if rows else []
+        evaluation.write_image_sums(self.folder, [files.name for files in items], sums)
         evaluation.write_results(result, self.folder, [*notes, *sources], published)
         network = source if task.network is None else type(self.as_loaded().module).__name__
         images = [i for c in callbacks if isinstance(c, Pictures) for i in c.images]
@@ -273,6 +280,7 @@ def build_head(settings: RunSettings, data: Any, depth_kind: str | None = None) 
 
 def build_task(settings: RunSettings, data: Any, network: nn.Module, head: Any) -> Any:
     """Build the task of a run."""
+    optimizer = build_from_config(settings.optimizer, "optimizer")  # the schedule has its rate
     scheduler = None
     if settings.scheduler is not None:
         section = dict(settings.scheduler)
@@ -284,7 +292,7 @@ def build_task(settings: RunSettings, data: Any, network: nn.Module, head: Any) 
         network=network,
         representation=data.representation,
         head=head,
-        optimizer=build_from_config(settings.optimizer, "optimizer"),
+        optimizer=optimizer,
         scheduler=scheduler,
     )
 

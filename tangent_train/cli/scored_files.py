@@ -74,14 +74,11 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     metric = head.build_metric()
     pictures = Pictures(folder / "panels", settings.panels)
     task = SimpleNamespace(network=None, head=head, representation=data.representation)
-    groups: dict[str, list[int]] = defaultdict(list)
     variants = Variants(head, data, len(scored.indices))
 
     def score() -> Iterator[None]:
         for place, (index, found) in enumerate(in_threads(scored.read, scored.indices)):
             if found is not None:
-                for group in data.groups(scored.items[index]):
-                    groups[group].append(len(scored.done))
                 labels, prediction = map(torch.from_numpy, found)
                 truth = head.truth(labels)
                 comparable = head.comparable(prediction, truth)
@@ -106,7 +103,7 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     settings = settings.model_copy(update={"representation": {"erp_height": data.erp_height}})
     run = Run(folder, settings, data, task, facts=scored.facts)
     run.write_settings()
-    run.report(predictions, groups, [pictures])
+    run.report(predictions, scored.done, [pictures])
 
 
 class Variants:

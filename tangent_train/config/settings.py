@@ -159,10 +159,13 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """folder for the results"""
     write: OneOrMore[str] | None = None
     """files to write: labels, color, overlay, probabilities (float16); of depth networks: depth,
-    color, points (PLY); null = all but probabilities and points"""
-    mask: float | ExistingPath | None = None
+    color, normals (EXR, PNG), points (PLY); null = all but probabilities, normals and points"""
+    mask: OneOrMore[float | ExistingPath] | None = None
     """panoramas: pixels that become unknown (0): below a latitude (-60), black in a PNG file, or in
-    a folder of one file per panorama; null = none"""
+    a folder of one file per panorama; also several, e.g. [-60,tripod.png]; null = none"""
+    mask_classes: OneOrMore[str] | None = None
+    """classes that become unknown, e.g. [sky], with mask= a folder that tangent-predict wrote
+    (labels/, classes.json); null = none"""
     min_confidence: Share = 0
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
     min_share: Share = 0
@@ -243,14 +246,24 @@ class RenderSettings(ImageSettings):
     # --- COLMAP ---
     colmap: bool = False
     """true: write one COLMAP project for all panoramas: images, masks and rig_config.json"""
-    mask: float | ExistingPath | None = None
-    """colmap=true: ignored pixels: below a latitude (-60), black in a PNG file, or in a folder of
-    one file per panorama; null = none"""
+    mask: OneOrMore[float | ExistingPath] | None = None
+    """colmap=true or nerfstudio=true: ignored pixels: below a latitude (-60), black in a PNG file,
+    or in a folder of one file per panorama; also several, e.g. [-60,tripod.png]; null = none"""
     mask_classes: OneOrMore[str] | None = None
     """ignored classes, e.g. [person], with mask= a folder that tangent-predict wrote (labels/,
     classes.json)"""
     poses: ExistingPath | None = None
-    """folder of a sparse COLMAP model, whose poses of panoramas are written as JSON"""
+    """folder of a sparse COLMAP model, whose poses of panoramas are written as JSON; with
+    nerfstudio=true, it or the JSON file"""
+
+    # --- Nerfstudio ---
+    nerfstudio: bool = False
+    """true: write a project as colmap=true, with transforms.json, z-depth and sparse_pc.ply for
+    splats; several panoramas need poses="""
+    depth: ExistingPath | None = None
+    """nerfstudio=true: folder of distances, as tangent-predict writes (depth/); null = no depth"""
+    depth_scale: PositiveFloat = 1000
+    """nerfstudio=true: units per meter in depth files of whole numbers"""
 
     # --- back to panoramas ---
     back: ExistingPath | None = None
@@ -301,9 +314,9 @@ class ImportSettings(Settings):
     scores: ScoreKind | None = None
     """output of the network: logits | probabilities | labels; null = recognized from its values"""
     depth: DepthKind | None = None
-    """kind of depth that the network predicts: metric_z | metric_distance | relative_depth |
-    relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface), else
-    it predicts classes"""
+    """kind of depth that the network predicts: metric_z | metric_distance | relative_z |
+    relative_depth | relative_disparity | relative_points | canonical_inverse | log_distance; null =
+    from the model (huggingface), else it predicts classes"""
     image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
     """fixed image size: [rows,columns] or the side; null = from the model"""
 

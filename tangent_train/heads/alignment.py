@@ -36,7 +36,7 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, ray_lengths, xyz_to_lonlat
 from tangent_train.geometry.sphere import Floats
-from tangent_train.kinds import Align, DepthKind
+from tangent_train.kinds import Align, DepthKind, depth_channels
 from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import Views
@@ -47,10 +47,14 @@ Indices = NDArray[np.int64]
 RAY_POWERS: dict[str, int] = {
     "metric_distance": 0,
     "metric_z": 1,
+    "relative_z": 1,
     "relative_depth": 1,
     "relative_disparity": -1,
 }
 """Powers of the ray length that convert depth, or disparity, to that along the ray."""
+
+_SHIFTED = "relative_depth", "relative_disparity"
+"""Kinds with an unknown shift of each view."""
 
 _FARTHEST_M = 1e4
 _FARTHEST = 100.0
@@ -97,15 +101,21 @@ def is_metric(kind: DepthKind) -> bool:
 def depth_of_output(
     output: Tensor, kind: DepthKind, ray_lengths: Tensor
 ) -> tuple[Tensor, DepthKind]:
-    """Convert `log_distance` and `canonical_inverse` to meters; others are returned unchanged.
+    """Convert `log_distance` and `canonical_inverse` to meters, and points to z-depth.
+
+    Other kinds are returned unchanged.
 
     The canonical inverse depth C is divided by the focal length in image widths (Bochkovskii et al.
     2024, section 3.2). That follows from the rays: at columns of distance d, the second difference
     of 1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as
     in the authors' code.
 
+    A point at distance ρ from the optical axis has the z-depth z + t with ρ = q (z + t), where q =
+    √(x² + y²) is known at its pixel (x, y) on the image plane at distance 1. The shift t of an
+    image follows by least squares, independently of its scale.
+
     Args:
-        output: Output of a network for whole images, ``(n, 1, h, w)``.
+        output: Output of a network for whole images, ``(n, depth_channels(kind), h, w)``.
         kind: Kind of the output.
         ray_lengths: ``(1 or n, 1, h, w)``, see `Views.ray_lengths`.
 
@@ -117,6 +127,13 @@ def depth_of_output(
     if kind == "canonical_inverse":
         inverse = output.where(output.isfinite(), torch.nan) * _span(ray_lengths)
         return 1 / inverse.clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
+    if kind == "relative_points":
+        z, off_axis = output[:, 2:], output[:, :2].norm(dim=1, keepdim=True)
+        q = (ray_lengths.square() - 1).clamp(min=0).sqrt().expand_as(z)
+        known = (z + off_axis).isfinite()
+        shift = (q * (off_axis - q * z)).where(known, 0).sum(dim=(1, 2, 3), keepdim=True)
+        squares = q.square().where(known, 0).sum(dim=(1, 2, 3), keepdim=True)
+        return z + shift / squares.clamp(min=_NEGLIGIBLE), "relative_z"
     return output, kind
 
 
@@ -156,7 +173,13 @@ def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Ten
         distance: Distances ``(n, …, h, w)``.
         kind: Kind of the result.
         ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
+
+    Raises:
+        SettingError: The output is points, with which no network is trained.
     """
+    if kind == "relative_points":
+        expected = "a network that returns one value per pixel, to train it"
+        raise SettingError("depth_kind", found=kind, expected=expected)
     if kind == "log_distance":
         return distance.log()
     if kind == "canonical_inverse":
@@ -328,15 +351,15 @@ def align_views(
     Args:
         parts: Samples of all sets of views.
         kind: Kind of the values, see `depth_of_output`.
-        mode: The correction; None for `scale` of metric and `affine` of relative kinds, to which
-            `grid` adds a grid of corrections. A single view is not corrected.
+        mode: The correction; None for `affine` of kinds with an unknown shift and `scale` of
+            others, to which `grid` adds a grid of corrections. A single view is not corrected.
 
     Raises:
         SettingError: `grid` is given for views without positions.
     """
     samples = ViewSamples.joined(parts)
     view, count, value = samples.view, samples.num_views, samples.value
-    usual: Align = "scale" if is_metric(kind) else "affine"
+    usual: Align = "affine" if kind in _SHIFTED else "scale"
     mode = (mode or usual) if count > 1 else "none"
     if mode == "grid" and np.isnan(samples.position).any():
         expected = "none, scale or affine, for views that are not pinhole images"
@@ -536,7 +559,8 @@ def _hat(positions: Floats) -> Floats:
 class AlignedMosaic:
     """Distances along the rays of a panorama or photo, whose views are aligned, then blended.
 
-    Views are blended in the logarithm of distance, or in disparity for networks that return it.
+    Views are blended in the logarithm of distance, or in disparity for networks that return it. A
+    confidence is a factor of their weights; pixels of confidence 0 are unknown.
 
     Args:
         shape: ``(H, W)`` of the panorama or photo.
@@ -568,6 +592,7 @@ class AlignedMosaic:
         self._lengths = None if camera_matrix is None else ray_lengths(camera_matrix, shape)
         points = sphere_points(shape) if camera_matrix is None else lattice(shape)
         self._points = points if valid is None else points[valid[tuple(points.T)]]
+        self.facts = {}
         self._parts: list[Tensor] = []
         self._sets: list[tuple[Views, Tensor]] = []
 
@@ -575,7 +600,8 @@ class AlignedMosaic:
         """Add the next views of a set; sets must be complete.
 
         Args:
-            outputs: Outputs of the network ``(n, 1, h, w)``.
+            outputs: Outputs of the network ``(n, C, h, w)``: `depth_channels` of its kind, and
+                optionally a confidence.
             views: The views.
         """
         self._parts.append(outputs)
@@ -592,27 +618,31 @@ class AlignedMosaic:
         Raises:
             SettingError: The views cannot be aligned in this way.
         """
-        device = self._sets[0][1].device
+        device, channels = self._sets[0][1].device, depth_channels(self._kind)
+        is_weighted = self._sets[0][1].shape[1] > channels
         all_lengths = [on_device(views.ray_lengths(), device) for views, _ in self._sets]
-        depths = [
-            depth_of_output(outputs, self._kind, lengths.to(outputs)[:, None])
-            for (_, outputs), lengths in zip(self._sets, all_lengths, strict=True)
-        ]
-        kind = depths[0][1]
+        depths, confidences = [], [outputs[:, channels:] for _, outputs in self._sets]
+        for (_, outputs), lengths, weight in zip(self._sets, all_lengths, confidences, strict=True):
+            values = outputs[:, :channels]
+            depth, kind = depth_of_output(values, self._kind, lengths.to(values)[:, None])
+            depths.append(depth.where(weight > 0, torch.nan) if is_weighted else depth)
         samples = [
             sample_views(depth, views, self._shape, self._points)
-            for (views, _), (depth, _) in zip(self._sets, depths, strict=True)
+            for (views, _), depth in zip(self._sets, depths, strict=True)
         ]
         alignment = align_views(samples, kind, self._align)
         finite = torch.cat([outputs.isfinite().flatten() for _, outputs in self._sets])
         share = 1 - float(finite.double().mean())
-        self.facts = alignment.facts | ({"not_finite": share} if share else {})
-        mosaic, first = MeanMosaic(self._shape, self._blend, device=device), 0
-        for (views, _), (depth, _), lengths in zip(self._sets, depths, all_lengths, strict=True):
+        self.facts |= alignment.facts | ({"not_finite": share} if share else {})
+        mosaic, first = MeanMosaic(self._shape, self._blend, 1 + is_weighted, device=device), 0
+        parts = zip(self._sets, depths, all_lengths, confidences, strict=True)
+        for (views, _), depth, lengths, weight in parts:
             part = slice(first, first + len(views))
-            mosaic.add(alignment.applied(depth, part, lengths), views)
+            values = alignment.applied(depth, part, lengths)
+            mosaic.add(torch.cat([values * weight, weight], 1) if is_weighted else values, views)
             first = part.stop
-        distance = distance_of(mosaic.values()[0], kind)
+        blended, *weights = mosaic.values()
+        distance = distance_of(blended / weights[0] if is_weighted else blended, kind)
         if not is_metric(self._kind):
             distance = distance / self._median(distance)
             distance = distance.where(distance <= _FARTHEST, torch.nan)

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
 from tangent_train.io.pixel_files import write_pixels
-from tangent_train.metrics.scores import Interval, ScoreColumn
+from tangent_train.metrics.image_sums import Sums
+from tangent_train.metrics.scores import ScoreColumn
 from tangent_train.rendering import Blend
 
 if TYPE_CHECKING:
@@ -110,8 +111,8 @@ class Head(nn.Module, ABC):
         consistency: Scores of `agreement` of each image ``(images,)``, by name of the column, if
             they are measured.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind (`source`)
-            holds the predicted pixels, from which pictures are drawn. By default, all kinds but
-            the last are written.
+            holds the predicted pixels, from which pictures are drawn.
+        usual_kinds: Kinds that are written by default, besides the first.
         summary: Name of the summary of an image in the summary file.
         summary_columns: Names in the summary of an image that ``summary.csv`` lists.
         unknown: Value of unknown pixels.
@@ -126,6 +127,7 @@ class Head(nn.Module, ABC):
     predict_settings: ClassVar[Mapping[str, str]] = NOTHING
     summary: ClassVar[str] = ""
     unknown: ClassVar[float] = 0
+    usual_kinds: ClassVar[Sequence[str]] = PICTURES
     waits: ClassVar[bool] = False
     num_outputs: int
     is_metric: bool = True
@@ -182,16 +184,13 @@ class Head(nn.Module, ABC):
             result: Value of the metric.
         """
 
-    def intervals(self, result: Any) -> Mapping[str, Interval]:
-        """Return 95 % bootstrap intervals over the images, for means that have one."""
-        return {}
+    def image_sums(self, result: Any) -> Sums:
+        """Return numbers of each image whose sums give the means; by default, none.
 
-    def scores_of(self, result: Any, places: Sequence[int]) -> Mapping[str, float]:
-        """Return scores over some of the images by name; by default, none.
+        Intervals, scores of groups and differences between evaluations follow from them.
 
         Args:
             result: Value of the metric.
-            places: Places of the images in the order of the evaluation.
         """
         return {}
 
@@ -234,7 +233,8 @@ class Head(nn.Module, ABC):
         Returns:
             An object with ``add(outputs, views)``, which adds the outputs ``(n, C, h, w)`` of some
             views, ``pixels()``, which returns the prediction ``(H, W)``, and ``facts`` about it.
-            ``not_finite`` is the share of the pixels whose outputs are NaN or infinite.
+            ``not_finite`` is the share of the pixels whose outputs are NaN or infinite. If it has
+            ``add_segments(segments, views)``, that adds the objects of some views, see `Segments`.
         """
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Any:
@@ -276,7 +276,8 @@ class Head(nn.Module, ABC):
         if foreign := set(write or ()).difference(self.suffixes):
             expected = f"{', '.join(self.suffixes)} for a network that predicts {self.source}"
             raise SettingError("write", found=", ".join(sorted(foreign)), expected=expected)
-        return list(self.suffixes)[:-1] if write is None else write
+        usual = [kind for kind in self.suffixes if kind in (self.source, *self.usual_kinds)]
+        return usual if write is None else write
 
     @property
     def source(self) -> str:
@@ -323,6 +324,10 @@ class Head(nn.Module, ABC):
         """Return the picture of a single image with its legend, see `paint`."""
         return self.paint(kind, rgb, pixels)
 
+    def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
+        """Return the maps of one image in the report, by argument of `encode_image`."""
+        return {"prediction": predicted.pixels}
+
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return the summary of one image.
 
@@ -331,6 +336,18 @@ class Head(nn.Module, ABC):
             is_counted: Mask ``(h, w)``, or of any shape that fits, that is True for counted pixels.
         """
         return {}
+
+    def entry(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> dict[str, Any]:
+        """Return the part of the entry of one image in the summary file, see `summarize`."""
+        return {self.summary: self.summarize(predicted, is_counted)}
+
+    def write_tables(self, folder: Path, entries: Sequence[Mapping[str, Any]]) -> None:
+        """Write further tables of all images to the output folder.
+
+        Args:
+            folder: Output folder.
+            entries: Entries of all images in the summary file.
+        """
 
     def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], Sequence[Sequence[str]]]:
         """Return title, header and rows of a table of the summaries of all images."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -23,16 +23,14 @@ from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
 from tangent_train.io.palette import class_colors
 from tangent_train.io.pixel_files import array_file, read_pixels
 from tangent_train.metrics import segmentation
+from tangent_train.metrics.image_sums import AbsentClass, Sums, means_of_sums
 from tangent_train.metrics.scores import (
-    Interval,
     ScoreColumn,
-    bootstrap,
     by_solid_angle,
     sphere_columns,
     with_solid_angle,
 )
-from tangent_train.metrics.segmentation import AbsentClass, SegmentationCounts
-from tangent_train.metrics.sphere import seam_step
+from tangent_train.metrics.segmentation import SegmentationCounts
 from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import ScoreMosaic
 
@@ -153,57 +151,26 @@ class ClassesHead(Head):
 
         return SegmentationMetric(len(self.class_names))
 
-    def _both(self, pixels: Any, angles: Any, compute: Callable[[Any], Any]) -> dict[str, Any]:
-        """Return scores by pixels; for panoramas, which have solid angles, by these too."""
-        by_angle = by_solid_angle(compute(angles)) if angles.any() else {}
-        return {**compute(pixels), **by_angle}
-
     def scores(self, result: SegmentationCounts) -> Scores:
         """Return scores by pixels; for panoramas, also by solid angle and latitude."""
         score = partial(segmentation.segmentation_scores, absent_class=self.absent_class)
-        given = result.pixels, result.solid_angle
         bands = [
             (score(band) if band.any() else score(band, absent_class="skip")).means
             for band in result.bands
         ]
-        of_classes = self._both(*given, lambda counts: score(counts).of_classes)
-        of_sphere = self._sphere_scores(result.regions.sum(axis=0), result.seam.sum(axis=0))
-        return Scores(
-            self._both(*given, lambda counts: score(counts).means)
-            | {name: float(value) for name, value in of_sphere.items() if len(result.seam)},
-            of_classes | {"share": score(result.pixels).share},
-            bands if result.solid_angle.any() else (),
-            result.pixels,
-        )
+        means = means_of_sums(self.image_sums(result), self.absent_class)
+        of_pixels = score(result.pixels)
+        of_classes = of_pixels.of_classes
+        if len(result.seam):
+            of_classes |= by_solid_angle(score(result.solid_angle).of_classes)
+        of_classes |= {"share": of_pixels.share}
+        return Scores(means, of_classes, bands if len(result.seam) else (), result.pixels)
 
-    def intervals(self, result: SegmentationCounts) -> dict[str, Interval]:
-        """Return intervals of the means."""
-        score = partial(segmentation.mean_scores, absent_class=self.absent_class)
-        pixels, angles = result.of_images.swapaxes(0, 1)
-        found = self._both(pixels, angles, lambda images: bootstrap(images, score))
-        if not len(result.seam):
-            return found
-        parts = result.regions.reshape(len(result.seam), -1), result.seam
-        split = parts[0].shape[1]
-
-        def of_sphere(sums: NDArray[np.float64]) -> dict[str, Any]:
-            regions = sums[:, :split].reshape(-1, *result.regions.shape[1:])
-            return self._sphere_scores(regions, sums[:, split:])
-
-        return found | bootstrap(np.concatenate(parts, axis=1), of_sphere)
-
-    def _sphere_scores(self, regions: NDArray[Any], seam: NDArray[Any]) -> dict[str, Any]:
-        """Return the scores that only panoramas have, see `SegmentationCounts`."""
-        scores = segmentation.mean_scores(regions, self.absent_class)["miou"]
-        poles, horizon, near, others, boundaries = np.moveaxis(scores, -1, 0)
-        gaps = {"pole_gap": poles - horizon, "seam_gap": near - others}
-        return {"boundary_miou": boundaries, **gaps, "seam_step": seam_step(seam)}
-
-    def scores_of(self, result: SegmentationCounts, places: Sequence[int]) -> dict[str, float]:
-        """Return mIoU and mAcc, of panoramas also by solid angle."""
-        score = partial(segmentation.mean_scores, absent_class=self.absent_class)
-        pixels, angles = result.of_images[list(places)].sum(axis=0)
-        return {name: float(mean) for name, mean in self._both(pixels, angles, score).items()}
+    def image_sums(self, result: SegmentationCounts) -> Sums:
+        """Return the counts of each image, of panoramas also by solid angle and region."""
+        pixels, solid_angle = result.of_images.swapaxes(0, 1)
+        of_sphere = {"solid_angle": solid_angle, "regions": result.regions, "seam": result.seam}
+        return {"pixels": pixels, **(of_sphere if len(result.seam) else {})}
 
     def agreement(self, first: PredictedImage, other: PredictedImage) -> dict[str, float]:
         """Return the share of equal labels, and the mIoU over the classes of the first labels."""
@@ -226,12 +193,14 @@ class ClassesHead(Head):
     ) -> LabelMosaic:
         """Return a mosaic of probabilities, which reuses the memory of an earlier one."""
         spare = self._spare.pop() if self._spare else None
-        mosaic = LabelMosaic(
-            self, shape, blend, averaged=averaged or self.min_share > 0, spare=spare, **settings
-        )
+        averaged = averaged or self.min_share > 0
+        mosaic = self._new_mosaic(shape, blend, averaged=averaged, spare=spare, **settings)
         if not isinstance(mosaic.sums, np.memmap):  # space on the disk is released at once
             weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
         return mosaic
+
+    def _new_mosaic(self, *given: Any, **settings: Any) -> LabelMosaic:
+        return LabelMosaic(self, *given, **settings)
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
         """Return the labels of the largest logits; 0 where a logit is NaN or infinite."""

@@ -17,21 +17,22 @@ from torch import Tensor
 
 from datamodules.core.depth import STEPS_PER_M
 from datamodules.core.label_map import DISTANCE
-from tangent_train.errors import SettingError, of_extra
-from tangent_train.files import write_bytes
+from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, to_right_handed
+from tangent_train.geometry.normals import equirect_normals, pinhole_normals
 from tangent_train.heads import alignment as views
 from tangent_train.heads import pictures
 from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
 from tangent_train.heads.classes import exact
-from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
-from tangent_train.kinds import Align, DepthKind
+from tangent_train.io.exr import check_exr, write_exr
+from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
+from tangent_train.io.point_clouds import write_points
+from tangent_train.kinds import Align, DepthKind, depth_channels
 from tangent_train.metrics import depth as metrics
+from tangent_train.metrics.image_sums import Sums, as_sums, means_of_sums
 from tangent_train.metrics.scores import (
-    Interval,
     ScoreColumn,
     by_solid_angle,
-    defined_mean,
     sphere_columns,
     with_solid_angle,
 )
@@ -61,6 +62,7 @@ _ROWS = {
     "step_before": "median step between views before alignment, %",
     "step_after": "median step between views after alignment, %",
     "isolated": "views without overlap",
+    "rotation_error_deg": "error of the network's own rotations, °",
 }
 """Rows of the table, by name in the summary; shares are in percent."""
 
@@ -138,11 +140,11 @@ class DistanceHead(Head):
         self.is_metric = views.is_metric(self.depth_kind)
         suffix = f".{depth_format or 'png'}"
         if suffix == ".exr":
-            with of_extra("exr", "depth_format"):
-                import OpenEXR  # noqa: F401
+            check_exr("depth_format")
         self._units_per_m, self._most = depth_scale, most_depth_m(suffix, depth_scale)
         self._points = 500_000 if points is None else points
-        self.suffixes = {"depth": suffix, "color": ".png", "points": ".ply"}
+        more = {"normals": ".exr", "points": ".ply"}
+        self.suffixes = {"depth": suffix, "color": ".png", **more}
         self._views_aligned: views.AlignedMosaic | None = None
 
     # Training
@@ -168,7 +170,8 @@ class DistanceHead(Head):
     ) -> Float[Tensor, "images height width"]:
         """Return the errors of the logarithm of the network's depth, or disparity.
 
-        Relative outputs are first scaled and shifted, see `scaled_and_shifted`.
+        Relative outputs are first scaled and shifted, see `scaled_and_shifted`; `relative_z` is
+        only scaled, to a mean error of 0.
 
         Args:
             outputs: Outputs of the network.
@@ -177,9 +180,12 @@ class DistanceHead(Head):
         values = outputs[:, 0].to(targets.dtype)  # float32 in half-precision training
         if self.depth_kind == "log_distance":
             return values - targets
-        if not self.is_metric:
+        if not self.is_metric and self.depth_kind != "relative_z":
             values = metrics.scaled_and_shifted(values, targets)
-        return values.clamp(min=_LEAST).log() - targets.log()
+        errors = values.clamp(min=_LEAST).log() - targets.log()
+        if self.depth_kind == "relative_z":
+            errors = errors - errors.nanmean(dim=(-2, -1), keepdim=True)
+        return errors
 
     def loss_norm(self, targets: Tensor) -> Tensor:
         """Return the number of pixels whose distance is known."""
@@ -207,24 +213,17 @@ class DistanceHead(Head):
         Args:
             result: Sums ``(images, 13, 10)``, see `error_sums`.
         """
-        pixels, angles = (metrics.mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
-        if not result[:, 1].any():
-            return Scores(pixels)
         bands = map(metrics.mean_depth_scores, result[:, metrics.BANDS].swapaxes(0, 1))
-        of_sphere = metrics.sphere_scores(result[:, metrics.SPHERE])
-        means = {name: float(defined_mean(values)) for name, values in of_sphere.items()}
-        return Scores(pixels | by_solid_angle(angles) | means, bands=list(bands))
+        means = means_of_sums(self.image_sums(result))
+        return Scores(means, bands=list(bands) if result[:, 1].any() else ())
 
-    def intervals(self, result: NDArray[np.float64]) -> dict[str, Interval]:
-        """Return intervals of the means."""
+    def image_sums(self, result: NDArray[np.float64]) -> Sums:
+        """Return the scores of each image."""
         pixels, angles = (metrics.depth_scores(result[:, weighting]) for weighting in (0, 1))
+        if not result[:, 1].any():
+            return as_sums(pixels)
         of_sphere = metrics.sphere_scores(result[:, metrics.SPHERE])
-        return metrics.depth_intervals(pixels | by_solid_angle(angles) | of_sphere)
-
-    def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
-        """Return means over some images; NaN if they have no known distances."""
-        undefined = dict.fromkeys(self.scores(result).means, np.nan)
-        return undefined | dict(self.scores(result[list(places)]).means)
+        return as_sums(pixels | by_solid_angle(angles) | of_sphere)
 
     def agreement(self, first: PredictedImage, other: PredictedImage) -> dict[str, float]:
         """Return the median of ``|d' / d − 1|``; d' is aligned with d as it is with the truth."""
@@ -272,7 +271,8 @@ class DistanceHead(Head):
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
         """Return distances along the rays of single crops."""
         lengths = ray_lengths[:, None]
-        values, kind = views.depth_of_output(outputs, self.depth_kind, lengths)
+        depth = outputs[:, : depth_channels(self.depth_kind)]  # without confidence
+        values, kind = views.depth_of_output(depth, self.depth_kind, lengths)
         return views.distance_of(views.along_rays(values, kind, lengths), kind)[:, 0]
 
     # Pictures and files
@@ -288,14 +288,26 @@ class DistanceHead(Head):
         return (0.0, "") if np.isnan(absrel) else (float(absrel), f"AbsRel {absrel:.3g}")
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
-        """Write depth, a colored picture and points."""
+        """Write depth, a colored picture, normals and points."""
         super().write(files, predicted)
+        if not {"normals", "points"}.intersection(files):
+            return
+        normals = np.nan_to_num(normals_of(predicted))
+        if "normals" in files:
+            write_exr(files["normals"], normals)
+            picture = np.rint((normals + 1) * 127.5 * normals.any(axis=-1, keepdims=True))
+            write_pixels(files["normals"].with_suffix(".png"), picture.astype(np.uint8))
         if "points" in files:
-            from trimesh import PointCloud  # half a second
+            pixels = spread_pixels(predicted, self._points)
+            points, colors = points_of(predicted, pixels)
+            write_points(files["points"], points, colors, normals[tuple(pixels)])
 
-            points, colors = points_of(predicted, spread_pixels(predicted, self._points))
-            content: Any = PointCloud(points.astype(np.float32), colors).export(file_type="ply")
-            write_bytes(files["points"], content)
+    def file_kinds(self, write: Sequence[str] | None) -> Sequence[str]:
+        """Return the kinds of output of the setting `write`, see `Head`."""
+        kinds = super().file_kinds(write)
+        if "normals" in kinds:
+            check_exr("write")
+        return kinds
 
     def write_source(self, file: Path, pixels: NDArray[Any]) -> None:
         """Write depth."""
@@ -424,3 +436,15 @@ def points_of(
         rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
         rays = rays @ np.linalg.inv(np.asarray(image.camera_matrix)).T
     return rays * depth[:, None].astype(np.float64), image.rgb[rows, columns]
+
+
+def normals_of(predicted: PredictedImage) -> NDArray[np.float32]:
+    """Return the normals ``(h, w, 3)`` of the surfaces, in the axes of `points_of`.
+
+    They are unit vectors that face the camera; NaN where unknown, see `equirect_normals`.
+    """
+    image, depth, _ = predicted
+    if image.area is None:
+        return pinhole_normals(depth, np.asarray(image.camera_matrix)).astype(np.float32)
+    whole = equirect_normals(image.area.place(depth))
+    return to_right_handed(image.cut(whole)).astype(np.float32)

@@ -22,7 +22,7 @@ from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import STEPS_PER_M, resize_depth
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
 from models.distortion_aware import make_ordinary
-from tangent_train.checkpoints.outputs import OutputNetwork, network_for_views, plain_output
+from tangent_train.checkpoints.outputs import OutputNetwork, named_outputs, network_for_views
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, random_rotation, rotation_about
 from tangent_train.geometry.sphere import equirect_elevations
@@ -61,9 +61,11 @@ _LEAST = 1e-4
 
 
 def sees_rays(network: nn.Module) -> bool:
-    """Return True if a network takes viewing rays, such as one with cross-image attention."""
-    inner = network.network if isinstance(network, OutputNetwork) else network
-    return "rays" in inspect.signature(inner.forward).parameters
+    """Return True if a network takes all views with their rays or cameras in one call."""
+    is_converted = isinstance(network, OutputNetwork)
+    inner: Any = network.network if is_converted else network
+    takes_cameras = is_converted and network.takes_cameras
+    return bool(takes_cameras) or "rays" in inspect.signature(inner.forward).parameters
 
 
 def views_per_forward(image_size: tuple[int, int]) -> int:
@@ -74,25 +76,31 @@ def views_per_forward(image_size: tuple[int, int]) -> int:
 @torch.no_grad()
 def scored_views(
     network: Callable[..., Any], sets: Iterable[ViewSet], per_forward: int
-) -> Iterator[tuple[Any, Tensor]]:
+) -> Iterator[tuple[Any, Tensor, Mapping[str, Tensor]]]:
     """Yield views of one image with their scores, a few at a time.
 
     Args:
         network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict that contains
-            them under ``"out"``. A network with cross-image attention is called once for a set with
-            rays, with all views: ``network(images, rays[None])``.
+            them under ``"out"``, and for depth optionally ``"confidence"`` ``(n, 1, h, w)``. A
+            network that takes rays or cameras is called once for a set with rays, with all views:
+            ``network(images, rays[None])``.
         sets: Sets of views.
         per_forward: Number of views per call of the network.
 
     Yields:
-        Views, and their float32 scores ``(n, K, h, w)``.
+        Views; their float32 scores ``(n, K, h, w)``, with the confidence as the last channel; and
+        all outputs of the network by name.
     """
     for views, images, rays in sets:
         step = per_forward if rays is None else len(views)
         for start in range(0, len(views), step):
             part = slice(start, min(start + step, len(views)))
             returned = network(images(part), *(() if rays is None else (rays[None],)))
-            yield views[part], plain_output(returned).float()
+            outputs = named_outputs(returned)
+            scores = outputs["out"]
+            if "confidence" in outputs:
+                scores = torch.cat([scores, outputs["confidence"]], dim=1)
+            yield views[part], scores.float(), outputs
 
 
 def upright_rays(
@@ -201,7 +209,7 @@ class Predictor:
         views: Selects the views of an image.
         device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
         view_batch_size: Number of views per call of the network, which limits memory; None for
-            as many as fit into 2^20 pixels. A network with cross-image attention takes all views of
+            as many as fit into 2^20 pixels. A network that takes rays or cameras gets all views of
             a panorama at once, and their outputs are kept in memory.
         compile: Arguments of `torch.compile`, empty for its defaults; None to disable it.
 
@@ -248,7 +256,10 @@ class Predictor:
             return network
         compiled: Any = torch.compile(network, **self._compile)
         # The next call of a CUDA graph overwrites the output of the last.
-        return lambda *given, **named: plain_output(compiled(*given, **named)).clone()
+        return lambda *given, **named: {
+            name: output.clone()
+            for name, output in named_outputs(compiled(*given, **named)).items()
+        }
 
     @torch.no_grad()
     def predict(
@@ -288,8 +299,12 @@ class Predictor:
         if self._sees_rays:
             network = partial(network, view_batch_size=per_forward)
         count = sum(len(views) for views, _, _ in sets)
-        for views, outputs in scored_views(network, sets, per_forward):
-            mosaic.add(outputs, views)
+        for views, scores, outputs in scored_views(network, sets, per_forward):
+            mosaic.add(scores, views)
+            if "segments" in outputs and hasattr(mosaic, "add_segments"):
+                mosaic.add_segments(outputs["segments"], views)
+            if "rotation_error_deg" in outputs:
+                mosaic.facts["rotation_error_deg"] = outputs["rotation_error_deg"]
             progress(len(views) / count)
         return mosaic
 
@@ -378,7 +393,7 @@ class UpLikelihood:
         sets = [(views, rendered.of(views), rays)]
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).nan_to_num(0).mean(dim=(1, 2))
-            for _, scores in scored_views(network, sets, per_forward)
+            for _, scores, _ in scored_views(network, sets, per_forward)
         ]
         return torch.cat(found).cpu().numpy()
 

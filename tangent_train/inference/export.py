@@ -19,6 +19,7 @@ from tangent_train.checkpoints.loaded import (
     load_network,
     write_onnx_description,
 )
+from tangent_train.checkpoints.outputs import example_inputs, plain_output
 from tangent_train.errors import SettingError, check_choice, first_line, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.imports import hide_output
@@ -85,6 +86,8 @@ def export_network(
         failure = "an exported network contains only the computation"
     elif is_onnx and is_aware:
         failure = "distortion-aware convolutions would be right for one size only"
+    elif is_onnx and getattr(loaded.network, "takes_cameras", False):
+        failure = "an ONNX file takes images without their cameras"
     for size in sizes if failure is None else ():
         try:
             with atomic_path(path) as temporary:
@@ -157,7 +160,8 @@ def _verified(loaded: LoadedNetwork, fixed_size: tuple[int, int] | None, path: P
     for size in sizes if fixed_size is None else [fixed_size]:
         for count in _BATCHES:
             images = _random_images(loaded, count, size)
-            expected, found = loaded.network(images), exported.network(images)
+            inputs = example_inputs(loaded.network, images)
+            expected, found = (plain_output(each.network(*inputs)) for each in (loaded, exported))
             span = float(expected.max() - expected.min())
             torch.testing.assert_close(
                 found,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import DataError, of_extra
+from tangent_train.errors import DataError, listed, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.io.image_files import MOST_PIXELS
 
@@ -110,12 +110,12 @@ def _chosen_names(
     elif colors and not indices:
         choices, expected = colors, "one layer with the channels R, G and B"
     if len(choices) != 1:
-        listed = ", ".join(names[:_MOST_NAMED]) + "…" * (len(names) > _MOST_NAMED)
+        known = listed(names, _MOST_NAMED)
         raise DataError(
             path,
             found="; ".join(", ".join(one) for one in choices) or "none",
             expected=expected,
-            remedy=f"Name one with depth_channel=, for training data data.depth_channel=: {listed}",
+            remedy=f"Name one with depth_channel=, for training data data.depth_channel=: {known}",
         )
     return choices[0]
 
@@ -136,8 +136,22 @@ def _is_depth(name: str, names: Sequence[str]) -> bool:
     return is_z or (last in ("y", "distance") and len(names) == 1 and not layer)
 
 
+def check_exr(setting: str) -> None:
+    """Refuse a setting that needs the OpenEXR package, before any work.
+
+    Raises:
+        SettingError: The OpenEXR package is missing.
+    """
+    with of_extra("exr", setting):
+        import OpenEXR  # noqa: F401
+
+
 def write_exr(path: Path, pixels: NDArray[Any]) -> None:
-    """Write ``(H, W)`` float32 pixels as channel Z, atomically.
+    """Write float32 pixels atomically.
+
+    Args:
+        path: The file.
+        pixels: ``(H, W)``, as channel Z; or ``(H, W, 3)``, as channels R, G and B.
 
     Raises:
         SettingError: The OpenEXR package is missing.
@@ -146,4 +160,5 @@ def write_exr(path: Path, pixels: NDArray[Any]) -> None:
         import OpenEXR
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with atomic_path(path) as temporary:
-        OpenEXR.File(header, {"Z": np.ascontiguousarray(pixels)}).write(str(temporary))
+        channels = {"Z" if pixels.ndim == 2 else "RGB": np.ascontiguousarray(pixels)}
+        OpenEXR.File(header, channels).write(str(temporary))

@@ -14,7 +14,6 @@ images that have it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import Annotated, Literal
 
@@ -27,19 +26,13 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from tangent_train.geometry import equirect_solid_angles
-from tangent_train.metrics.scores import (
-    BAND_EDGES_DEG,
-    Interval,
-    band_of_rows,
-    bootstrap,
-    defined_mean,
-)
+from tangent_train.metrics.image_sums import seam_step
+from tangent_train.metrics.scores import BAND_EDGES_DEG, band_of_rows, defined_mean
 from tangent_train.metrics.sphere import (
     REGIONS,
     SEAM_SUMS,
     beside_seam,
     row_weights,
-    seam_step,
     seam_sums,
 )
 
@@ -247,16 +240,3 @@ def sphere_scores(sums: Float[np.ndarray, "images regions sums"]) -> dict[str, N
     poles, horizon, seam, elsewhere = depth_scores(sums[:, :-1])["absrel"].T
     steps = seam_step(sums[:, -1, :SEAM_SUMS])
     return {"pole_gap": poles - horizon, "seam_gap": seam - elsewhere, "seam_step": steps}
-
-
-def depth_intervals(scores: Mapping[str, NDArray[np.float64]]) -> dict[str, Interval]:
-    """Return 95 % bootstrap intervals of the means of scores ``(images,)``, see `bootstrap`."""
-    columns = np.stack([*scores.values()], axis=1)
-    defined = ~np.isnan(columns)
-
-    def means(totals: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
-        """Return the mean scores of draws ``(draws, 2, scores)``: sums and numbers of images."""
-        numbers = np.where(totals[:, 1] > 0, totals[:, 1], np.nan)
-        return dict(zip(scores, (totals[:, 0] / numbers).T, strict=True))
-
-    return bootstrap(np.stack([np.where(defined, columns, 0), defined], axis=1), means)

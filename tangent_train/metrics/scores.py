@@ -1,13 +1,12 @@
-"""Names, units, means and intervals of scores, shared by all kinds of output."""
+"""Names, units and means of scores, shared by all kinds of output."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import NDArray
 
 _Value = TypeVar("_Value")
@@ -121,40 +120,3 @@ def defined_mean(scores: NDArray[np.float64]) -> NDArray[np.float64]:
     count = np.sum(~np.isnan(scores), axis=-1)
     total = np.nansum(scores, axis=-1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def bootstrap(
-    of_images: Float[np.ndarray, "images ..."],
-    score: Callable[[NDArray[np.float64]], Mapping[str, NDArray[np.float64]]],
-    draws: int = 1000,
-    seed: int = 0,
-) -> dict[str, Interval]:
-    """Compute 95 % percentile bootstrap intervals of scores, with images as the unit.
-
-    Each draw samples as many images as there are, with replacement, and scores them as one data set
-    (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). The result does not
-    depend on the order of the images or the number of processes.
-
-    Args:
-        of_images: Numbers of each image from whose sums the scores follow.
-        score: Function that returns scores ``(draws,)`` by name, given sums ``(draws, …)``.
-        draws: Number of draws.
-        seed: Seed of the draws.
-
-    Returns:
-        Intervals by name; empty for a single image. Undefined scores have no interval.
-    """
-    count = len(of_images)
-    if count <= 1:
-        return {}
-    flat = of_images.reshape(count, -1)
-    flat = flat[np.lexsort(flat.T)]
-    generator = np.random.default_rng(seed)
-    times = generator.multinomial(count, np.full(count, 1 / count), size=draws)
-    sums = (times.astype(np.float64) @ flat).reshape(draws, *of_images.shape[1:])
-    intervals = {}
-    for name, means in score(sums).items():
-        if not np.isnan(means).all():
-            low, high = np.nanquantile(means, (0.025, 0.975))
-            intervals[name] = (float(low), float(high))
-    return intervals

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Integer
+from jaxtyping import Integer
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
-from tangent_train.metrics.scores import BAND_EDGES_DEG, band_of_rows, defined_mean
+from tangent_train.metrics.image_sums import AbsentClass, class_scores, mean_scores
+from tangent_train.metrics.scores import BAND_EDGES_DEG, band_of_rows
 from tangent_train.metrics.sphere import (
     REGIONS,
     SEAM_SUMS,
     beside_seam,
-    boundary_sums,
-    right,
+    count_rows,
+    near_boundary,
     row_weights,
-    seam_sums,
 )
-
-AbsentClass = Literal["skip", "zero"]
-"""Treatment of a class without labeled pixels: left out of means, or counted as 0."""
 
 _COUNTS_AT_ONCE = 2**22
 """Counts of rows of a panorama that are held at once, 32 MiB."""
@@ -65,34 +62,13 @@ def segmentation_scores(
     sums = np.stack(_class_sums(np.asarray(confusion, np.float64)))
     means = {name: float(score) for name, score in mean_scores(sums, absent_class).items()}
     share = sums[0] / max(sums[0].sum(), 1e-300)
-    return SegmentationScores(means, _class_scores(sums, absent_class), share)
+    return SegmentationScores(means, class_scores(sums, absent_class), share)
 
 
 def _class_sums(confusion: Any) -> tuple[Any, Any, Any]:
     """Return labeled pixels, predicted pixels and hits of each class (array or tensor)."""
     known = confusion[1:]
     return known.sum(1), known[:, 1:].sum(0), known[:, 1:].diagonal()
-
-
-def _class_scores(
-    sums: NDArray[np.float64], absent_class: AbsentClass
-) -> dict[str, NDArray[np.float64]]:
-    """Return IoU and accuracy ``(..., K)``, given the sums ``(..., 3, K)``."""
-    truth, predicted, hits = np.moveaxis(sums, -2, 0)
-    missing = np.nan if absent_class == "skip" else 0.0
-    areas = {"iou": truth + predicted - hits, "accuracy": truth}
-    return {
-        name: np.where(truth > 0, hits / np.maximum(area, 1e-300), missing)
-        for name, area in areas.items()
-    }
-
-
-def mean_scores(
-    sums: Float[np.ndarray, "*some 3 classes"], absent_class: AbsentClass = "skip"
-) -> dict[str, NDArray[np.float64]]:
-    """Return mIoU and mAcc, given labeled area, predicted area and hits of each class."""
-    scores = _class_scores(sums, absent_class)
-    return {"miou": defined_mean(scores["iou"]), "macc": defined_mean(scores["accuracy"])}
 
 
 class SegmentationCounts(NamedTuple):
@@ -134,59 +110,67 @@ def count_image(
         SettingError: A class index is out of range.
     """
     k = num_classes
-    pairs = torch.add(_checked(prediction, k), _checked(truth, k), alpha=k)
-    bands = torch.zeros((len(BAND_EDGES_DEG) - 1, k, k), dtype=torch.int64, device=truth.device)
+    for labels in (prediction, truth):
+        _check(labels, k)
     if truth.ndim != 2:
-        pixels = _counted(pairs[None], k)[0]
+        pixels = _confusion(prediction, truth, k)
+        bands = pixels.new_zeros((len(BAND_EDGES_DEG) - 1, k, k))
         steradians = torch.zeros_like(pixels, dtype=torch.float64)
         regions = steradians.new_zeros((0, len(REGIONS) + 1, 3, k - 1))
         seam = steradians.new_zeros((0, SEAM_SUMS))
     else:
-        height, width = truth.shape
-        weights = torch.as_tensor(
-            np.stack([equirect_solid_angles((height, width)), *row_weights(height)])
-        ).to(truth.device)
-        band, beside = (
-            torch.as_tensor(places, device=truth.device)
-            for places in (band_of_rows(height), beside_seam(width))
-        )
-        by_angle = weights.new_zeros((len(weights) + 1, k, k))
-        step = max(1, _COUNTS_AT_ONCE // k**2)
-        # Integer counts first, so that results do not depend on the order or the device.
-        for part in (slice(top, top + step) for top in range(0, height, step)):
-            of_rows, of_seam = _counted(pairs[part], k), _counted(pairs[part][:, beside], k)
-            bands.index_add_(0, band[part], of_rows)
-            by_angle[:-1] += torch.tensordot(weights[:, part], of_rows.double(), dims=1)
-            by_angle[-1] += torch.tensordot(weights[0, part], of_seam.double(), dims=1)
+        bands, by_angle, edges, seam = _count_panorama(prediction, truth, k)
         pixels, (steradians, poles, horizon, seam_zone) = bands.sum(dim=0), by_angle
         matrices = poles, horizon, seam_zone, steradians - seam_zone
-        maps = [labels.cpu().numpy().astype(np.uint8) for labels in (prediction, truth)]
-        edges = torch.from_numpy(boundary_sums(maps[0], maps[1], k)).to(truth.device)
         of_regions = [torch.stack(_class_sums(matrix)) for matrix in matrices]
         regions = torch.stack([*of_regions, edges])[None]
-        known = maps[1] > UNKNOWN
-        changes = [labels != right(labels) for labels in maps]
-        at_seam = seam_sums(changes[0], changes[1], known & right(known))
-        seam = torch.from_numpy(at_seam)[None]
     sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
-    counts = pixels, steradians, bands, torch.stack(sums)[None], regions, seam.to(truth.device)
-    return SegmentationCounts(*counts)
+    counts = pixels, steradians, bands, torch.stack(sums)[None], regions, seam
+    return SegmentationCounts(*(part.to(truth.device) for part in counts))
 
 
-def _counted(pairs: Tensor, num_classes: int) -> Tensor:
-    """Count pairs ``(n, …)`` in n matrices; those of unknown pixels are left out."""
-    k, rows = num_classes, torch.arange(len(pairs), device=pairs.device, dtype=torch.int32)
-    flat = (pairs.flatten(1) + (rows * k * k)[:, None]).flatten()
-    counts = torch.bincount(flat, minlength=len(pairs) * k * k).reshape(-1, k, k)
-    counts[:, UNKNOWN] = 0
+def _count_panorama(prediction: Tensor, truth: Tensor, k: int) -> tuple[Tensor, ...]:
+    """Count the pixels of one panorama, on the CPU.
+
+    Returns:
+        Pixels ``(6, K+1, K+1)`` of `SegmentationCounts.bands`; steradians ``(4, K+1, K+1)`` of all
+        pixels, near the poles, near the horizon and beside the seam; those near boundaries ``(3,
+        K)``; and `SegmentationCounts.seam`.
+    """
+    labels = [part.to("cpu", torch.uint8).contiguous().numpy() for part in (prediction, truth)]
+    height, width = truth.shape
+    angles, beside = equirect_solid_angles((height, width)), len(beside_seam(width)) // 2
+    weights = torch.from_numpy(np.stack([angles, *row_weights(height)]))
+    band, by_angle = torch.from_numpy(band_of_rows(height)), weights.new_zeros((4, k, k))
+    bands = torch.zeros((len(BAND_EDGES_DEG) - 1, k, k), dtype=torch.int64)
+    near = [near_boundary(np.where(labels[1] > UNKNOWN, *labels)), near_boundary(labels[1])]
+    edges, changes = np.zeros((3, height, k), np.int64), np.zeros((6, height), np.int64)
+    step = max(1, _COUNTS_AT_ONCE // k**2)
+    # Integer counts first, so that results do not depend on the order.
+    for part in (slice(top, top + step) for top in range(0, height, step)):
+        pairs = np.zeros((2, len(labels[1][part]), k, k), np.int64)
+        maps = tuple(one[part] for one in (*labels, *near))
+        count_rows(maps, beside, pairs, edges[:, part], changes[:, part])
+        of_rows, of_seam = torch.from_numpy(pairs)
+        bands.index_add_(0, band[part], of_rows)
+        by_angle[:-1] += torch.tensordot(weights[:, part], of_rows.double(), dims=1)
+        by_angle[-1] += torch.tensordot(weights[0, part], of_seam.double(), dims=1)
+    of_edges = np.stack([angles @ counts[:, 1:] for counts in edges])
+    seam = np.array([angles @ counts for counts in changes])
+    return bands, by_angle, torch.from_numpy(of_edges), torch.from_numpy(seam)[None]
+
+
+def _confusion(prediction: Tensor, truth: Tensor, k: int) -> Tensor:
+    """Count the pixels of known classes."""
+    pairs = torch.add(prediction.int(), truth.int(), alpha=k).flatten()
+    counts = torch.bincount(pairs, minlength=k * k).reshape(k, k)
+    counts[UNKNOWN] = 0
     return counts
 
 
-def _checked(indices: Tensor, num_classes: int) -> Tensor:
-    indices = indices.int()
+def _check(indices: Tensor, num_classes: int) -> None:
     least, greatest = map(int, indices.aminmax()) if indices.numel() else (0, 0)
     if least < 0 or greatest >= num_classes:
         raise SettingError(
             "class index", found=f"{least} to {greatest}", expected=f"0 to {num_classes - 1}"
         )
-    return indices

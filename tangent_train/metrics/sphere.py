@@ -13,16 +13,15 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from functools import lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_solid_angles
+from tangent_train.rendering.kernels import Array, njit_exact
 
 REGIONS = ("poles", "horizon", "seam", "elsewhere")
 SEAM_SUMS = 6
@@ -49,7 +48,7 @@ def beside_seam(width: int) -> NDArray[np.intp]:
 def seam_sums(
     predicted: NDArray[Any], true: NDArray[Any], known: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Sum the disagreement of neighbors in a row, see `seam_step`.
+    """Sum the disagreement of neighbors in a row, see `metrics.image_sums.seam_step`.
 
     Args:
         predicted: ``(H, W)`` disagreement of each pixel with its right neighbor.
@@ -69,19 +68,6 @@ def seam_sums(
     return np.array([*across, *others])
 
 
-def seam_step(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the seam step, given results ``(…, 6)`` of `seam_sums`; NaN without known pairs."""
-    parts = sums.reshape(*sums.shape[:-1], 2, 3)
-    excess = (parts[..., 0] - parts[..., 1]) / np.where(parts[..., 2] > 0, parts[..., 2], np.nan)
-    step: NDArray[np.float64] = excess[..., 0] - excess[..., 1]
-    return step
-
-
-def right(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the right neighbors of pixels ``(H, W)``."""
-    return np.concatenate([values[:, 1:], values[:, :1]], axis=1)
-
-
 def near_boundary(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return a mask of the pixels close to another label, ``(H, W)``.
 
@@ -95,24 +81,34 @@ def near_boundary(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:
     down, across = _reach(height, width)
     # Beyond a pole, rows continue half a revolution away.
     beyond = [np.roll(part[::-1], width // 2, axis=1) for part in (labels[:down], labels[-down:])]
-    tall = np.concatenate([beyond[0], labels, beyond[1]])
-    column = np.ones((2 * down + 1, 1), np.uint8)
-    least, most = (morph(tall, column)[down:-down] for morph in (cv2.erode, cv2.dilate))
-    # Another label is close if the labels above and below a close pixel, or those of two neighbors
-    # along the parallel, are not all the same.
-    alone = (least != most).view(np.uint8)
-    pairs = alone | (least != right(least))
-    near, starts = np.empty((height, width), np.bool_), np.flatnonzero(np.diff(across)) + 1
-    for top, bottom in itertools.pairwise([0, *starts.tolist(), height]):
-        reach = int(across[top])
-        beside = (0, 0, reach, reach, cv2.BORDER_WRAP)
-        wide = [cv2.copyMakeBorder(part[top:bottom], *beside) for part in (alone, pairs)]
-        counts = cv2.boxFilter(
-            wide[1], cv2.CV_32S, (2 * reach, 1), anchor=(reach, 0), normalize=False
-        )
-        near[top:bottom] = counts[:, reach:-reach]
-        near[top:bottom] |= wide[0][:, 2 * reach :].view(np.bool_)
+    near = np.zeros((height, width), np.bool_)
+    _mark(np.concatenate([beyond[0], labels, beyond[1]]), down, across, near)
     return near
+
+
+@njit_exact
+def _mark(tall: Array, down: int, across: Array, near: Array) -> None:
+    """Mark pixels near boundaries; see `near_boundary`."""
+    width = near.shape[1]
+    same = np.zeros(width, np.int32)  # equal labels in a column, up to this row
+    for last in range(len(tall)):
+        line, above = tall[last], tall[max(last - 1, 0)]
+        for column in range(width):
+            same[column] = same[column] + 1 if line[column] == above[column] else 1
+        row = last - 2 * down
+        if row < 0:
+            continue
+        # Another label is close if the labels above and below a close pixel, or two neighbors
+        # along the parallel, are not the same.
+        middle, reach, marked = tall[last - down], across[row], -width
+        for column in range(width):
+            is_mixed = same[column] <= 2 * down
+            if is_mixed or middle[column] != middle[column + 1 if column + 1 < width else 0]:
+                for place in range(
+                    max(marked, column - reach + (not is_mixed)), column + reach + 1
+                ):
+                    near[row, place - width if place >= width else place] = True
+                marked = column + reach + 1
 
 
 @lru_cache(maxsize=4)
@@ -124,24 +120,37 @@ def _reach(height: int, width: int) -> tuple[int, NDArray[np.intp]]:
     return down, across.clip(1, width // 2).astype(np.intp)
 
 
-def boundary_sums(
-    prediction: NDArray[np.uint8], truth: NDArray[np.uint8], num_classes: int
-) -> NDArray[np.float64]:
-    """Return the steradians ``(3, K)`` of classes near boundaries: true, predicted, and both.
+@njit_exact
+def count_rows(
+    maps: tuple[Array, Array, Array, Array], beside: int, pairs: Array, edges: Array, changes: Array
+) -> None:
+    """Count the pixels of each of n rows of a panorama; add them to the counts.
 
     Args:
-        prediction: ``(H, W)`` labels.
-        truth: ``(H, W)`` labels; 0 is unknown: not counted, and another label beside a class.
-        num_classes: K + 1, the unknown class 0 included.
+        maps: ``(n, W)`` predicted and true labels, and `near_boundary` of both. Unknown pixels, of
+            true label 0, are not counted.
+        beside: Columns on each side of the seam that are beside it.
+        pairs: ``(2, n, K+1, K+1)`` pixels by true and predicted label; those beside the seam.
+        edges: ``(3, n, K+1)`` pixels near boundaries, by true and by predicted label; those of
+            equal labels near both boundaries.
+        changes: ``(6, n)`` unequal predicted and true neighbors, and all, across the seam; others.
     """
-    height, width = truth.shape
-    angles, known = equirect_solid_angles((height, width)), truth > 0
-    prediction = np.where(known, prediction, truth)
-    near_true, near_predicted = near_boundary(truth) & known, near_boundary(prediction) & known
-    both = near_true & near_predicted & (truth == prediction)
-    sums = []
-    for labels, mask in ((truth, near_true), (prediction, near_predicted), (truth, both)):
-        rows = np.repeat(np.arange(height) * num_classes, np.count_nonzero(mask, axis=1))
-        counts = np.bincount(rows + labels[mask], minlength=height * num_classes)
-        sums.append(angles @ counts.reshape(height, num_classes)[:, 1:])
-    return np.stack(sums)
+    predicted, true, near_predicted, near_true = maps
+    rows, width = true.shape
+    for row in range(rows):
+        for column in range(width):
+            p, t = predicted[row, column], true[row, column]
+            if t == 0:
+                continue
+            pairs[0, row, t, p] += 1
+            if column < beside or column >= width - beside:
+                pairs[1, row, t, p] += 1
+            is_near, is_true = near_predicted[row, column], near_true[row, column]
+            edges[0, row, t] += is_true
+            edges[1, row, p] += is_near
+            edges[2, row, t] += is_true and is_near and t == p
+            first, right = (3, column + 1) if column + 1 < width else (0, 0)
+            if true[row, right] > 0:
+                changes[first, row] += p != predicted[row, right]
+                changes[first + 1, row] += t != true[row, right]
+                changes[first + 2, row] += 1

@@ -20,7 +20,13 @@ from tangent_train.checkpoints.loaded import (
     load_network,
     write_onnx_description,
 )
-from tangent_train.checkpoints.outputs import Groups, network_for_views, plain_output
+from tangent_train.checkpoints.outputs import (
+    Groups,
+    OutputNetwork,
+    example_inputs,
+    network_for_views,
+    plain_output,
+)
 from tangent_train.config.build import build_from_config
 from tangent_train.config.from_file import classes_to_trust
 from tangent_train.errors import SettingError, first_line, width_height
@@ -33,7 +39,7 @@ from tangent_train.inference.views import (
     photo_network_settings,
 )
 from tangent_train.io.image_files import composed
-from tangent_train.kinds import ScoreKind
+from tangent_train.kinds import ScoreKind, depth_channels
 from tangent_train.photo_networks.network import PhotoNetwork
 
 _PHOTO_LEVELS = (5, 13)
@@ -90,7 +96,8 @@ def import_network(
         kind = score_kind or network.score_kind or usual_kind(output, len(network.score_names))
         count = output.shape[1]
         names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
-        described = {"class_names": names, "groups": groups, "score_kind": kind}
+        things = tuple(name for name in map(composed, network.things) if name in names)
+        described = {"class_names": names, "groups": groups, "score_kind": kind, "things": things}
     # A network of a fixed size gets square images of its longer side, see `NetworkDescription`.
     seen = photo_network_settings(max(size) if fixed else min(size), levels, base_level, views)
     loaded = LoadedNetwork(
@@ -123,20 +130,24 @@ def _output(network: PhotoNetwork, size: tuple[int, int]) -> Tensor:
     """Return the output ``(1, K, h, w)`` for an image of noise; label maps and depth have K = 1."""
     image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0))
     images = normalize_channels(image, [1, 1, 1], network.normalization)
+    module, channels = network.module.eval(), 0
+    if network.depth_kind is not None:
+        channels = depth_channels(network.depth_kind)
+        module = OutputNetwork(module, channels, kind=None)
     try:
-        output = plain_output(network.module.eval()(images)).float()
+        output = plain_output(module(*example_inputs(module, images))).float()
     except Exception as error:  # networks raise many kinds about images that they do not take
         found = f"{type(error).__name__} ({first_line(error)})"
     else:
         output = output if output.ndim == image.ndim else output[:, None]
-        fits = output.shape[2:] == size and (network.depth_kind is None or output.shape[1] == 1)
+        fits = output.shape[2:] == size and channels in (0, output.shape[1])
         if fits and output.isfinite().any():
             return output
         found = f"{tuple(output.shape)}, {int(output.isfinite().sum())} numbers are finite"
     raise SettingError(
         "output of the network",
         found=f"{found} for an RGB image of {width_height(size)}",
-        expected="scores (1, K, h, w) of the image's size; labels or depth with K = 1",
+        expected="scores (1, K, h, w) of the image's size; labels or depth with K = 1, points 3",
         remedy="If it needs another size, set image_size=[rows,columns].",
     )
 

@@ -42,6 +42,9 @@ _FEW = 4
 _TILE_SCORES = 2**18
 """Number of sums in a tile: they fit into the processor's cache."""
 
+_CANDIDATES = 8
+"""Numbers that views may vote for at a pixel, at most; further ones do not count."""
+
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _LN_2, _LOG2_E = np.float32(math.log(2)), np.float32(1 / math.log(2))
 _C3, _C4, _C5, _C6 = np.float32(1 / 6), np.float32(1 / 24), np.float32(1 / 120), np.float32(1 / 720)
@@ -803,3 +806,45 @@ def best_classes(
     """
     for i in range(start, stop):
         _write_classes(total[i], num_classes, min_confidence, 0.0, labels[i])
+
+
+@njit_fast
+def vote(
+    start: int, stop: int, numbers: Array, canvas: CanvasGeometry, factors: Array, winners: Array
+) -> None:
+    """Write the number with the largest sum of weights at every pixel of rows ``start:stop``.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        numbers: ``(n, h, w)`` int32 numbers at the pixels of images; the nearest pixel votes.
+        canvas: Geometry of the images and the canvas, with feather weights.
+        factors: Factor of the weight of each number.
+        winners: ``(H, W)`` int32, written; 0 where no image has a weight.
+    """
+    side, width = numbers.shape[1:], winners.shape[1]
+    u, v, weight = np.empty(width), np.empty(width), np.empty(width)
+    found = np.zeros((width, _CANDIDATES), np.int32)
+    sums = np.zeros((width, _CANDIDATES), np.float32)
+    for i in range(start, stop):
+        sums[:] = 0
+        for m in range(len(numbers)):
+            begin, span = canvas.spans[m, i, 0], canvas.spans[m, i, 1]
+            for back in range(0, width + 1, width):
+                first, last = max(0, begin - back), min(width, begin + span - back)
+                n = max(0, last - first)
+                row = canvas.rows[i]
+                _project(canvas.matrices[m], row, canvas.columns, first, first + n, u, v)
+                _feather(side, u, v, weight[:n])
+                for p in range(n):
+                    if weight[p] <= 0:
+                        continue
+                    number = numbers[m, np.int64(v[p] + 0.5), np.int64(u[p] + 0.5)]
+                    for c in range(_CANDIDATES):
+                        if sums[first + p, c] == 0 or found[first + p, c] == number:
+                            found[first + p, c] = number
+                            sums[first + p, c] += np.float32(weight[p]) * factors[number]
+                            break
+        for j in range(width):
+            best = np.argmax(sums[j])
+            winners[i, j] = found[j, best] if sums[j, best] > 0 else 0

@@ -5,6 +5,7 @@ The folder of a finished run contains ``results.json``, and the settings as ``co
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -14,18 +15,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml  # type: ignore[import-untyped]
+from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from tangent_train.errors import DataError, counted, listed
-from tangent_train.files import csv_text, read_json, write_text
-from tangent_train.metrics.depth import depth_intervals
+from tangent_train.files import csv_text, read_json, write_bytes, write_text
+from tangent_train.metrics.image_sums import Sums, as_sums, drawn_scores, intervals, means_of_sums
 from tangent_train.metrics.scores import BAND_EDGES_DEG, SOLID_ANGLE, Interval, ScoreColumn
 from tangent_train.results.tables import Table, markdown_text, score_text
 
 if TYPE_CHECKING:
     from tangent_train.heads import Head
 
-RESULTS_FILE = "results.json"
+RESULTS_FILE, SUMS_FILE = "results.json", "results.npz"
 
 Band = tuple[float, float]
 """South and north of a latitude band, in degrees."""
@@ -121,7 +123,14 @@ class EvaluationResult:
         return content.decode() + "\n"
 
 
-def evaluation_result(head: Head, result: Any, noun: str, images: int) -> EvaluationResult:
+def evaluation_result(
+    head: Head,
+    result: Any,
+    noun: str,
+    images: int,
+    sums: Sums | None = None,
+    groups: Mapping[str, Sequence[int]] = {},
+) -> EvaluationResult:
     """Return the result of an evaluation.
 
     Args:
@@ -129,12 +138,16 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
         result: Value of its metric; None if only the consistency was measured.
         noun: Plural name of the images: panoramas, photos, shapes.
         images: Number of images.
+        sums: Numbers of each image (`Head.image_sums`); None for the order of the evaluation.
+        groups: Places of the images of each group in these.
     """
-    consistency = plain_scores({name: np.nanmean(v) for name, v in head.consistency.items()})
-    intervals = depth_intervals(head.consistency) if consistency else {}
+    consistency = plain_scores(means_of_sums(as_sums(head.consistency)))
     if result is None:
         columns = {name: replace(head.columns[name], is_main=True) for name in consistency}
-        return EvaluationResult(noun, images, columns, consistency, intervals=intervals)
+        ends = intervals(drawn_scores(sums or {}))
+        return EvaluationResult(noun, images, columns, consistency, intervals=ends)
+    sums = head.image_sums(result) if sums is None else sums
+    absent = head.facts.get("absent_class", "skip")
     means, of_classes, bands, confusion = head.scores(result)
     scores = list(zip(*(values.tolist() for values in of_classes.values()), strict=True))
     names = head.class_names[len(head.class_names) - len(scores) :]  # without the unknown class
@@ -153,7 +166,12 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
             for (north, south), band in zip(edges, bands, strict=False)
         ],
         confusion=() if confusion is None else confusion.tolist(),
-        intervals={**head.intervals(result), **intervals},
+        groups=[
+            {"group": group, "images": len(places)}
+            | plain_scores(means_of_sums(sums, absent, places))
+            for group, places in sorted(groups.items())
+        ],
+        intervals=intervals(drawn_scores(sums, absent)),
     )
 
 
@@ -249,7 +267,8 @@ def result_tables(result: EvaluationResult) -> list[Table]:
         ("By group", ["group", "images"], result.groups),
     ):
         if entries:
-            columns = {n: result.columns[n] for n in entries[0] if n in result.columns}
+            shown = [n for n in entries[0] if n in result.columns]
+            columns = {n: c for n in shown if not (c := result.columns[n]).of_sphere}
             rows = [
                 [str(entry[name]) for name in firsts]
                 + [score_text(entry[name], c.unit) for name, c in columns.items()]
@@ -312,6 +331,26 @@ def confusion_table(result: EvaluationResult) -> Table:
     ]
     note = "Rows: ground truth; columns: prediction; % of the row."
     return Table("Confusion", ("", *result.class_names), rows, note, shades=shares.tolist())
+
+
+def write_image_sums(folder: Path, names: Sequence[str], sums: Sums) -> None:
+    """Write ``results.npz``: the name and the numbers of each image, see `Head.image_sums`."""
+    if sums:
+        content = io.BytesIO()
+        arrays: dict[str, Any] = {"images": np.array(names, np.str_), **sums}
+        np.savez_compressed(content, **arrays)
+        write_bytes(folder / SUMS_FILE, content.getvalue())
+
+
+def read_image_sums(folder: Path) -> tuple[NDArray[np.str_], Sums]:
+    """Read the names of the images of an evaluation, and the numbers of each.
+
+    Raises:
+        OSError: The evaluation has no such file.
+    """
+    with np.load(folder / SUMS_FILE, allow_pickle=False) as file:
+        sums = dict(file)
+    return sums.pop("images"), sums
 
 
 def write_results(

@@ -395,14 +395,8 @@ class PixelTask(Task):
 
     def _evaluated_views(self, sets: Iterable[Any]) -> Iterator[tuple[Any, Tensor, Any]]:
         """Yield views, their scores (see `scored_views`), and all outputs, for `loss_sum`."""
-        kept: list[Mapping[str, Tensor]] = []
-
-        def network(*inputs: Tensor) -> Mapping[str, Tensor]:
-            kept[:] = [self(*inputs)]
-            return kept[0]
-
-        for views, scores in scored_views(network, sets, self.eval_view_batch_size):
-            yield views, scores, {**kept[0], "out": scores}
+        for views, scores, outputs in scored_views(self, sets, self.eval_view_batch_size):
+            yield views, scores, {**outputs, "out": scores}
 
     @torch.no_grad()
     def evaluate(self, batch: Any) -> Tensor:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from datamodules.core.inputs import RGB_NORMALIZATION
 from tangent_train.geometry import equirect_directions
 from tangent_train.heads.alignment import AlignedMosaic
-from tangent_train.io.pixel_files import read_depth_m, write_pixels
+from tangent_train.io.pixel_files import read_depth_m, read_pixels, write_pixels
 from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import read_png
 from tests.inference.trained import sphere, write_depth_checkpoint
@@ -52,7 +52,7 @@ def test_files_of_a_panorama(
     """Below latitude −60°, rows from (90 + 60) / 180 · 64 = 53.3 on, pixels are masked."""
     rgb, output = sphere(64), tmp_path / "out"
     write_pixels(tmp_path / "in" / "hall.png", rgb)
-    common = {"checkpoint": network, "mask": -60, "write": "[depth,color,points]"}
+    common = {"checkpoint": network, "mask": -60, "write": "[depth,color,points,normals]"}
     entry = predict(**common, points=3000)["hall"]["depth"]
     expected = _distances(rgb)
     expected[53:] = 0
@@ -69,8 +69,6 @@ def test_files_of_a_panorama(
 
     assert read_png(output / "color" / "hall.png").shape == (64 + 22, 128, 3)
     cloud = trimesh.load(output / "points" / "hall.ply")
-    header = b"property float x\nproperty float y\nproperty float z\nproperty uchar red"
-    assert header in (output / "points" / "hall.ply").read_bytes()
     directions = equirect_directions((64, 128)).reshape(-1, 3) * (1, -1, 1)
     distance_m = np.linalg.norm(cloud.vertices, axis=-1)
     pixels = (cloud.vertices @ directions.T).argmax(axis=1)
@@ -79,6 +77,16 @@ def test_files_of_a_panorama(
     np.testing.assert_array_equal(cloud.colors[:, :3], rgb.reshape(-1, 3)[pixels])
     assert len(set(pixels)) == len(pixels)
     assert 2900 < len(pixels) <= 3000
+    normals = read_pixels(output / "normals" / "hall.exr", indices=False)
+    np.testing.assert_array_equal(normals.any(axis=-1), depth > 0)
+    at_points = normals.reshape(-1, 3)[pixels]
+    stored = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    in_cloud = np.stack([stored[name] for name in ("nx", "ny", "nz")], axis=-1)
+    np.testing.assert_allclose(in_cloud, at_points, atol=1e-6)
+    assert (at_points * cloud.vertices).sum(axis=-1).max() < 0, "they face the center"
+    picture = read_png(output / "normals" / "hall.png")[..., ::-1]
+    np.testing.assert_allclose(picture[depth > 0] / 127.5 - 1, normals[depth > 0], atol=0.005)
+    assert not picture[depth == 0].any()
 
     printed = capsys.readouterr().out
     assert "A panorama is predicted in 20 views" in printed
@@ -89,6 +97,22 @@ def test_files_of_a_panorama(
     assert (row["unit"], row["median"]) == ("m", str(entry["median"]))
     assert not (output / "classes.json").exists()
     assert "hall" in (output / "report.html").read_text()
+
+
+def test_the_sky_of_a_label_map_has_no_distance(
+    tmp_path: Path, network: Path, predict: Predict
+) -> None:
+    """Together with a mask of the nadir."""
+    write_pixels(tmp_path / "in" / "a.png", sphere(64))
+    labels = np.full((64, 128), 2, np.uint8)
+    labels[:20, :50] = 3
+    write_pixels(tmp_path / "labeled" / "labels" / "a.png", labels)
+    (tmp_path / "labeled" / "classes.json").write_text('{"wall": 2, "sky": 3}')
+    masks = {"mask": f"[-60,{tmp_path / 'labeled'}]", "mask_classes": "[sky]"}
+    predict(checkpoint=network, write="[depth]", **masks)
+    unknown = labels == 3
+    unknown[53:] = True
+    np.testing.assert_array_equal(_depth(tmp_path / "out" / "depth" / "a.png") == 0, unknown)
 
 
 def test_views_are_aligned_while_the_next_image_is_predicted(
@@ -161,7 +185,10 @@ def test_relative_depth_is_marked(
         ({"label_map": "ade20k_to_stanford2d3ds"}, "found a network that predicts distance"),
         ({"min_confidence": 0.5}, "min_confidence: found 0.5; expected 0: nothing reads it"),
         ({"upright": "auto"}, "predicts distance; .*Use upright=pose"),
-        ({"write": "[labels,color]"}, "write: found labels; expected depth, color, points for"),
+        (
+            {"write": "[labels,color]"},
+            "write: found labels; expected depth, color, normals, points for",
+        ),
         ({"points": 9}, "points: found 9; expected null: nothing reads it"),
         ({"depth": "."}, "depth: found .*nothing reads it"),
         ({"write": "[points]", "checkpoint": None}, "write: found points; expected labels, color"),

@@ -8,6 +8,7 @@ from typing import Any, get_args
 import pytest
 import torch
 
+from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
 from tangent_train.heads.alignment import (
     along_rays,
@@ -16,10 +17,10 @@ from tangent_train.heads.alignment import (
     from_distance,
     is_disparity,
 )
-from tangent_train.kinds import DepthKind
+from tangent_train.kinds import DepthKind, depth_channels
 
 
-@pytest.mark.parametrize("kind", get_args(DepthKind))
+@pytest.mark.parametrize("kind", [kind for kind in get_args(DepthKind) if "points" not in kind])
 def test_outputs_of_every_kind_are_distances_along_the_rays(kind: DepthKind) -> None:
     """A plane 2 m in front of a camera of 90°: its z-depth is 2 m everywhere."""
     lengths = torch.from_numpy(ray_lengths(camera_matrix_from_fov(90, (6, 8)), (6, 8)))[None, None]
@@ -30,6 +31,7 @@ def test_outputs_of_every_kind_are_distances_along_the_rays(kind: DepthKind) -> 
         "metric_distance": distance,
         "metric_z": 2,
         "canonical_inverse": 1 / (2 * 2),  # the image is 2 m wide at 1 m
+        "relative_z": 2,
         "relative_depth": 2,
         "relative_disparity": 1 / 2,
     }
@@ -64,6 +66,30 @@ def test_values_without_a_distance_are_unknown() -> None:
     odd, one = torch.tensor([torch.nan, torch.inf, -torch.inf, 0.0, -1.0]), torch.ones(1)
     known = {"log_distance": [0, 0, 0, 1, 1], "canonical_inverse": [0, 0, 0, 1, 1]}
     for kind in get_args(DepthKind):
-        depth, depth_kind = depth_of_output(odd, kind, one)
+        output = odd.expand(1, depth_channels(kind), 1, 5)
+        depth, depth_kind = depth_of_output(output, kind, one)
         found = distance_of(along_rays(depth, depth_kind, one), depth_kind)
-        assert found.isfinite().tolist() == known.get(kind, [0] * 5)
+        assert found.isfinite().flatten().tolist() == known.get(kind, [0] * 5)
+
+
+def test_points_of_a_known_camera_have_one_shift_of_z() -> None:
+    """Two views of a slanted plane, in units of their own; their z is shifted, a corner unknown."""
+    size = 6, 8
+    camera = camera_matrix_from_fov(80, size)
+    lengths = torch.from_numpy(ray_lengths(camera, size))[None, None]
+    rows, columns = torch.meshgrid(torch.arange(6.0), torch.arange(8.0), indexing="ij")
+    x, y = (columns - 3.5) / camera[0, 0], (rows - 2.5) / camera[1, 1]
+    z = 2 / (1 + 0.3 * x - 0.2 * y)
+    points = torch.stack([x * z, y * z, z]).double()
+    scales = torch.tensor([[1.0], [3.0]]).double()
+    shifts = torch.tensor([[0.5], [-1.5]]).double()
+    output = scales[..., None, None] * points
+    output[:, 2] -= shifts[..., None]
+    output[1, :, :2, :2] = torch.nan
+    found, kind = depth_of_output(output, "relative_points", lengths)
+    assert kind == "relative_z"
+    torch.testing.assert_close(found[0, 0], z.double())
+    torch.testing.assert_close(found[1, 0, 2:], 3 * z[2:].double())
+    assert found[1, 0, :2, :2].isnan().all()
+    with pytest.raises(SettingError, match="one value per pixel, to train it"):
+        from_distance(output, "relative_points", lengths)

@@ -14,12 +14,12 @@ from tangent_train.metrics.collected import DepthMetric
 from tangent_train.metrics.depth import (
     Alignment,
     DepthProtocol,
-    depth_intervals,
     depth_scores,
     error_sums,
     mean_depth_scores,
     scaled_and_shifted,
 )
+from tangent_train.metrics.image_sums import as_sums, drawn_scores, intervals, means_of_sums
 
 Image = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -102,16 +102,17 @@ def test_intervals_contain_the_mean_and_leave_out_images_without_truth() -> None
         [error_sums(*map(torch.from_numpy, _image(k))).numpy()[0] for k in range(12)]
         + [np.zeros(10)]
     )
-    intervals, means = depth_intervals(depth_scores(sums)), mean_depth_scores(sums)
-    assert intervals.keys() == means.keys()
-    for name, (low, high) in intervals.items():
+    numbers = as_sums(depth_scores(sums))
+    found, means = intervals(drawn_scores(numbers)), mean_depth_scores(sums)
+    assert means_of_sums(numbers) == pytest.approx(means)
+    assert found.keys() == means.keys()
+    for name, (low, high) in found.items():
         assert low <= means[name] <= high, name
     scores = depth_scores(sums[:12])["absrel"]  # the mean of 12 numbers: ± 1.96 standard errors
     error = scores.std(ddof=1) / math.sqrt(12)
-    low, high = intervals["absrel"]
+    low, high = found["absrel"]
     assert (high - low) / (2 * 1.96 * error) == pytest.approx(1, abs=0.15)
-    assert depth_intervals(depth_scores(sums[::-1])) == intervals
-    assert depth_intervals(depth_scores(sums[:1])) == {}
+    assert drawn_scores(as_sums(depth_scores(sums[:1]))) == {}
 
 
 @pytest.mark.parametrize("quantity", ["distance", "disparity"])

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,9 @@ from torchmetrics.utilities import dim_zero_cat
 from tangent_train.errors import SettingError
 from tangent_train.heads import ImageClassHead
 from tangent_train.metrics.collected import ClassificationMetric, SegmentationMetric
-from tangent_train.metrics.scores import BAND_EDGES_DEG, bootstrap
-from tangent_train.metrics.segmentation import (
-    mean_scores,
-    segmentation_scores,
-)
+from tangent_train.metrics.image_sums import drawn_scores, intervals
+from tangent_train.metrics.scores import BAND_EDGES_DEG
+from tangent_train.metrics.segmentation import segmentation_scores
 
 CLASSES = 5
 
@@ -136,8 +133,6 @@ def _random_images(count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 @pytest.mark.parametrize("absent", ["skip", "zero"])
 def test_intervals_are_those_of_data_sets_drawn_one_after_another(absent: Any) -> None:
     confusions, of_images = _random_images(6)
-    flat = of_images.reshape(6, -1)
-    confusions = confusions[np.lexsort(flat.T)]
     rng = np.random.default_rng(5)
     scores = []
     for _ in range(250):
@@ -147,8 +142,7 @@ def test_intervals_are_those_of_data_sets_drawn_one_after_another(absent: Any) -
             whole += count * confusion
         scores.append([*segmentation_scores(whole, absent).means.values()])
     low, high = np.percentile(scores, [2.5, 97.5], axis=0)
-    score = partial(mean_scores, absent_class=absent)
-    found = bootstrap(of_images, score, draws=250, seed=5)
+    found = intervals(drawn_scores({"pixels": of_images}, absent, draws=250, seed=5))
     assert found["miou"] == pytest.approx((low[0], high[0]), rel=1e-12)
     assert found["macc"] == pytest.approx((low[1], high[1]), rel=1e-12)
     assert low[0] < high[0]

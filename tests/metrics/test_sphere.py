@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.heads import ClassesHead, DistanceHead
+from tangent_train.metrics.image_sums import drawn_scores, intervals
 from tangent_train.metrics.sphere import BOUNDARY_DEG, near_boundary
 
 NAMES = ("unknown", "a", "b", "c")
@@ -27,7 +28,7 @@ def _scores(
     for prediction, truth in images:
         metric.update(*(torch.from_numpy(np.ascontiguousarray(x)) for x in (prediction, truth)))
     result = metric.compute()
-    return dict(head.scores(result).means), dict(head.intervals(result))
+    return dict(head.scores(result).means), intervals(drawn_scores(head.image_sums(result)))
 
 
 def _stripes(height: int, width: int) -> NDArray[np.uint8]:
@@ -38,10 +39,10 @@ def _stripes(height: int, width: int) -> NDArray[np.uint8]:
 
 def test_a_perfect_prediction_has_no_gaps() -> None:
     truth = _stripes(48, 96)
-    scores, intervals = _scores([(truth, truth)] * 2)
+    scores, of_scores = _scores([(truth, truth)] * 2)
     assert scores["boundary_miou"] == 1
     assert {scores[name] for name in ("pole_gap", "seam_gap", "seam_step")} == {0}
-    assert intervals["seam_step"] == (0, 0)
+    assert of_scores["seam_step"] == (0, 0)
 
 
 def test_errors_near_the_poles_are_the_pole_gap() -> None:
@@ -118,8 +119,8 @@ def test_pixels_near_boundaries_equal_loops(shape: tuple[int, int]) -> None:
 
 def test_photos_have_no_such_scores() -> None:
     crops = np.ones((2, 8, 8), np.uint8)
-    scores, intervals = _scores([(crops, crops)] * 2)
-    assert not {"seam_step", "pole_gap", "boundary_miou"} & (scores.keys() | intervals.keys())
+    scores, of_scores = _scores([(crops, crops)] * 2)
+    assert not {"seam_step", "pole_gap", "boundary_miou"} & (scores.keys() | of_scores.keys())
     scores, _ = _scores([(crops * 1.0, crops * 1.0)], DistanceHead(depth_kind="metric_distance"))
     assert "seam_step" not in scores
 

@@ -40,8 +40,9 @@ def _matrices(pixels: dict[tuple[int, int], int] | None = None) -> SegmentationC
         erp[place] = count
     bands = np.zeros((6, 4, 4), np.int64)
     bands[2] = erp
-    no_images = np.zeros((0, 2, 3, 3)), np.zeros((0, 5, 3, 3)), np.zeros((0, 6))
-    return SegmentationCounts(erp, erp / 10, bands, *no_images)
+    sums = np.stack([erp[1:].sum(axis=1), erp[:, 1:].sum(axis=0), erp.diagonal()[1:]])
+    of_one_image = np.stack([sums, sums / 10])[None], np.zeros((1, 5, 3, 3)), np.zeros((1, 6))
+    return SegmentationCounts(erp, erp / 10, bands, *of_one_image)
 
 
 def _record(
@@ -106,13 +107,17 @@ def test_classes_of_no_pixel_are_left_out_of_the_table() -> None:
 
 
 def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
-    none = np.zeros((4, 4))
-    of_images = np.zeros((2, 2, 3, 3))
-    of_images[:, 0] = 1
-    matrices = _matrices()._replace(
-        solid_angle=none, bands=np.zeros((6, 4, 4), np.int64), of_images=of_images
+    counts = _matrices()
+    halves = np.concatenate([counts.of_images] * 2) / 2 * [[[[1]], [[0]]]]
+    of_photos = SegmentationCounts(
+        counts.pixels,
+        np.zeros((4, 4)),
+        np.zeros((6, 4, 4), np.int64),
+        halves,
+        counts.regions[:0],
+        counts.seam[:0],
     )
-    record = _record(matrices, "zero", "photos")
+    record = _record(of_photos, "zero", "photos")
     assert record.scores["miou_solid_angle"] is None
     assert not record.latitude_bands
     (table,) = result_tables(record)
@@ -137,25 +142,25 @@ def test_means_over_fewer_classes_have_a_note() -> None:
 
 def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
     """Two images, of one class each: a draw has either, or both."""
-    of_images = np.zeros((2, 2, 3, 3))
-    of_images[0, :, :, 0] = [100, 100, 90]  # labeled, predicted, hits
-    of_images[1, 0, :, 1] = [100, 100, 50]
-    of_images[1, 1, :, 1] = [10, 10, 4]
-    record = _record(_matrices()._replace(of_images=of_images))
-    expected = {
-        "macc": (0.5, 0.9),
-        "miou": (50 / 150, 90 / 110),
-        "macc_solid_angle": (0.4, 0.9),
-        "miou_solid_angle": (4 / 16, 90 / 110),
-    }
+    of_images = np.array(  # labeled, predicted and hits of walls, floors and sofas
+        [
+            [[[100, 0, 0], [90, 10, 0], [90, 0, 0]], [[10, 0, 0], [9, 1, 0], [9, 0, 0]]],
+            [[[0, 100, 0], [50, 50, 0], [0, 50, 0]], [[0, 10, 0], [6, 4, 0], [0, 4, 0]]],
+        ],
+        np.float64,
+    )
+    parts = {"regions": np.zeros((2, 5, 3, 3)), "seam": np.zeros((2, 6))}
+    record = _record(_matrices()._replace(of_images=of_images, **parts))
+    expected = dict.fromkeys(("macc", "miou"), (0.5, 0.9))
+    expected |= dict.fromkeys(("macc_solid_angle", "miou_solid_angle"), (0.4, 0.9))
     assert record.intervals == {name: pytest.approx(ends) for name, ends in expected.items()}
-    text = "mAcc 70.0 [50.0, 90.0]\u00a0%, mIoU 52.7 [33.3, 81.8]\u00a0%, "
+    text = "mAcc 70.0 [50.0, 90.0]\u00a0%, mIoU 52.7 [50.0, 90.0]\u00a0%, "
     assert headline(record).startswith(text)
     assert headline(record).endswith(
         " over 7 panoramas, 2 of 3 classes (in brackets: 95\u00a0% intervals)"
     )
     write_results(record, tmp_path)
-    mean = "| mean | 52.7 [33.3, 81.8] | 70.0 [50.0, 90.0] | 52.7 [25.0, 81.8] | 70.0 [40.0, 90.0]"
+    mean = "| mean | 52.7 [50.0, 90.0] | 70.0 [50.0, 90.0] | 46.3 [40.0, 90.0] | 65.0 [40.0, 90.0]"
     assert mean in (tmp_path / "results.md").read_text()
     read = json.loads((tmp_path / "results.json").read_text())["intervals"]
     assert {name: tuple(ends) for name, ends in read.items()} == record.intervals
