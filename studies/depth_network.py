@@ -8,8 +8,10 @@ ZInD, whose layouts are known above the horizon: furniture is not in a layout.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from dataclasses import replace
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,12 +25,13 @@ from studies.output import Row, save
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_latitudes
-from tangent_train.heads import head_of
-from tangent_train.heads.alignment import along_rays, depth_of_output, distance_of
-from tangent_train.inference.engine import Predictor, RenderedViews
+from tangent_train.geometry.camera import half_width
+from tangent_train.heads.alignment import AlignedMosaic
+from tangent_train.inference.engine import RenderedViews
 from tangent_train.inference.images import InputImage, read_panorama
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.pixel_files import read_depth_m, read_rgb
+from tangent_train.kinds import Align, DepthKind
 from tangent_train.metrics.depth import BANDS, DepthProtocol, depth_scores, error_sums
 from tangent_train.metrics.scores import BAND_EDGES_DEG
 from tangent_train.rendering.resampling import resize
@@ -39,9 +42,18 @@ _FARTHEST_M = 100.0
 _SHAPE = 512, 1024
 """Rows and columns of all panoramas."""
 
-_MODES = "none", "scale", "grid"
-_UNALIGNED = "equirectangular image", "six cube faces"
-"""Views without overlap, of which every mode is the same."""
+_MODES: tuple[Align, ...] = "none", "scale", "grid"
+_CAMERAS: dict[str, DepthKind] = {"ignored": "metric_z", "used": "canonical_z"}
+_MODES_OF: dict[str, Sequence[Align]] = {
+    "equirectangular image": _MODES[:1],  # without overlap, all are equal
+    "six cube faces": _MODES[:1],
+    "20 tangent images (b = 0)": _MODES,
+    "16 horizontal views, 130° and 100°": _MODES,
+    "18 horizontal views of 100°": _MODES,
+    "views like the photos": _MODES,
+}
+"""Corrections that are measured; without `grid`, which takes long, for other views."""
+_SHOWN = "absrel", "delta1", "absrel, median", "delta1, median"
 
 
 class Panorama(NamedTuple):
@@ -81,14 +93,13 @@ def homes(root: Path) -> Iterator[Panorama]:
         yield Panorama("ZInD", image, torch.from_numpy(distance).float())
 
 
-def view_options(loaded: LoadedNetwork, fov_deg: Sequence[float]) -> dict[str, dict[str, Any]]:
+def view_options(loaded: LoadedNetwork) -> dict[str, dict[str, Any]]:
     """Return the arguments of `ViewSelector` by the name of the views.
 
     Args:
         loaded: The network.
-        fov_deg: Horizontal and vertical field of view of the photos of its training.
     """
-    level, size = loaded.photo_level or loaded.level, list(loaded.fixed_size or loaded.image_size)
+    level, fov_deg = loaded.photo_level or loaded.level, loaded.photo_fov_deg or (90.0, 90.0)
     found: dict[str, dict[str, Any]] = {
         "equirectangular image": {"views": "erp"},
         "six cube faces": {"views": "cubemap"},
@@ -97,12 +108,12 @@ def view_options(loaded: LoadedNetwork, fov_deg: Sequence[float]) -> dict[str, d
         "16 horizontal views, 130° and 100°": {"views": "horizontal_wide"},
         "18 horizontal views of 100°": {"views": "horizontal"},
     }
-    own = {"option": "horizontal", "rings": None, "fov": list(fov_deg), "dim": size}
-    for overlap in (0.1, 0.25, 0.4):
-        views = own | {"square_pixels": False, "overlap": overlap}
-        found[f"own field of view, overlap {overlap:g}"] = {"views": views, "levels": level}
-    square = own | {"fov": [fov_deg[0]] * 2, "overlap": 0.25}
-    found[f"{fov_deg[0]:g}° × {fov_deg[0]:g}°"] = {"views": square, "levels": level}
+    found["views like the photos"] = {"views": "horizontal_camera"}
+    for across in (80.0, 100.0):  # stretched as the photos were
+        ratio = half_width(fov_deg[1]) / half_width(fov_deg[0])
+        down = 2 * math.degrees(math.atan(half_width(across) * ratio))
+        views = {"option": "horizontal_camera", "fov": [across, down]}
+        found[f"{across:g}° × {down:.0f}°, stretched"] = {"views": views}
     return found
 
 
@@ -128,17 +139,39 @@ def measure(
 ) -> list[Row]:
     """Return the scores of every panorama, with all views and corrections."""
     rows: list[Row] = []
+    span = 2 * half_width((loaded.photo_fov_deg or (90.0, 90.0))[0])
     for name, given in options.items():
-        for mode in _MODES[:1] if name in _UNALIGNED else _MODES:
-            head = head_of(loaded, align=mode)
-            predictor = Predictor(loaded, head, ViewSelector(loaded, **given))
-            for number, (group, image, truth) in enumerate(panoramas):
-                mosaic = predictor.predict(image)
-                row: Row = {"data": group, "panorama": number, "views": name, "align": mode}
+        selector = ViewSelector(loaded, **given)
+        for group, image, truth in panoramas:
+            ((source, shape, sets, _),) = selector(image)
+            rendered = RenderedViews(loaded, source, shape, "cpu")
+            with torch.no_grad():
+                outputs = [loaded.network(rendered.of(views)(slice(None))) for views in sets]
+            for camera, mode in product(_CAMERAS, _MODES):
+                if mode not in _MODES_OF.get(name, _MODES[:2]):
+                    continue
+                mosaic = AlignedMosaic(image.shape, _CAMERAS[camera], "feather", mode)
+                for views, output in zip(sets, outputs, strict=True):
+                    mosaic.add(output / (span if camera == "ignored" else 1), views)
+                row: Row = {"data": group, "views": name, "camera": camera, "align": mode}
                 row |= scores(mosaic.pixels(), truth)
                 steps = {key: mosaic.facts[key] for key in ("step_before", "step_after")}
                 rows.append(row | {"number": mosaic.facts["views"]} | steps)
+        for camera in _CAMERAS:
+            print(name, camera, mean_of(rows, name, camera), flush=True)
     return rows
+
+
+def mean_of(rows: Sequence[Row], name: str, camera: str) -> str:
+    """Return a short text of the last scores, as progress."""
+    of_last = [row for row in rows if (row["views"], row["camera"]) == (name, camera)]
+    groups = dict.fromkeys((row["data"], row["align"]) for row in of_last)
+    texts = []
+    for group in groups:
+        found = [row for row in of_last if (row["data"], row["align"]) == group]
+        errors = [np.mean([row[score] for row in found]) for score in _SHOWN]
+        texts.append(f"{' '.join(group)} {' '.join(f'{error:.3f}' for error in errors)}")
+    return "; ".join(texts)
 
 
 def scales_of_views(
@@ -151,18 +184,17 @@ def scales_of_views(
         views with a known distance in a quarter of their pixels.
     """
     rows: list[Row] = []
+    plain = replace(loaded, depth_kind="metric_z")
     for name, given in options.items():
         ratios: dict[tuple[str, int], list[float]] = {}
-        selector = ViewSelector(loaded, **given)
+        selector = ViewSelector(plain, **given)
         for group, image, truth in panoramas:
             ((source, shape, sets, _),) = selector(image)
-            rendered = RenderedViews(loaded, source, shape, "cpu")
+            rendered = RenderedViews(plain, source, shape, "cpu")
             for views in sets:
-                lengths = torch.from_numpy(views.ray_lengths())[:, None]
+                lengths = torch.from_numpy(views.ray_lengths())
                 with torch.no_grad():
-                    output = loaded.network(rendered.of(views)(slice(None)))
-                depth, kind = depth_of_output(output, loaded.depth_kind or "metric_z", lengths)
-                distance = distance_of(along_rays(depth, kind, lengths), kind)[:, 0]
+                    distance = plain.network(rendered.of(views)(slice(None)))[:, 0] * lengths
                 true = views.render(truth[None], "nearest")[:, 0]
                 heights = np.arcsin(views.rays()[:, 2, 2])
                 for height, d, g in zip(heights, distance, true, strict=True):
@@ -180,15 +212,16 @@ def scales_of_views(
 
 def means(rows: Sequence[Row], seed: int = 0) -> list[Row]:
     """Return means over panoramas, and 95 % bootstrap intervals of three scores."""
-    keys = list(dict.fromkeys((row["data"], row["views"], row["align"]) for row in rows))
+    keys = list(dict.fromkeys(tuple(row.values())[:4] for row in rows))
     rng, found = np.random.default_rng(seed), []
     for key in keys:
-        of_key = [row for row in rows if (row["data"], row["views"], row["align"]) == key]
+        of_key = [row for row in rows if tuple(row.values())[:4] == key]
         table: NDArray[np.float64] = np.array(
             [[np.nan if v is None else v for v in list(row.values())[4:]] for row in of_key], float
         )
         names = list(of_key[0])[4:]
-        row = {"data": key[0], "panoramas": len(of_key), "views": key[1], "align": key[2]}
+        row: Row = {"data": key[0], "panoramas": len(of_key)}
+        row |= dict(zip(("views", "camera", "align"), key[1:], strict=True))
         for name, values in zip(names, table.T, strict=True):
             known = values[~np.isnan(values)]
             row[name] = float(known.mean()) if len(known) else ""
@@ -208,11 +241,10 @@ def main() -> None:
     parser.add_argument("network", type=Path)
     parser.add_argument("--rooms", nargs="*", default=[], metavar="IMAGE=DISTANCES")
     parser.add_argument("--homes", type=Path)
-    parser.add_argument("--fov", nargs=2, type=float, default=(62.0, 48.0))
     given = parser.parse_args()
     loaded = load_network(given.network)
     panoramas = [*rooms(given.rooms), *(homes(given.homes) if given.homes else ())]
-    options = view_options(loaded, given.fov)
+    options = view_options(loaded)
     save("depth_network", means(measure(loaded, panoramas, options)), digits=3)
     pinhole = {name: each for name, each in options.items() if "erp" not in each.values()}
     save("depth_network_scales", scales_of_views(loaded, panoramas, pinhole), digits=3)
