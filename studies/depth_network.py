@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,9 +30,10 @@ from tangent_train.inference.engine import RenderedViews
 from tangent_train.inference.images import InputImage, read_panorama
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.pixel_files import read_depth_m, read_rgb
-from tangent_train.kinds import Align, DepthKind
+from tangent_train.kinds import Align
 from tangent_train.metrics.depth import BANDS, DepthProtocol, depth_scores, error_sums
 from tangent_train.metrics.scores import BAND_EDGES_DEG
+from tangent_train.rendering.representations.views import PinholeViews, Views
 from tangent_train.rendering.resampling import resize
 
 _FARTHEST_M = 100.0
@@ -43,17 +43,16 @@ _SHAPE = 512, 1024
 """Rows and columns of all panoramas."""
 
 _MODES: tuple[Align, ...] = "none", "scale", "grid"
-_CAMERAS: dict[str, DepthKind] = {"ignored": "metric_z", "used": "canonical_z"}
-_MODES_OF: dict[str, Sequence[Align]] = {
-    "equirectangular image": _MODES[:1],  # without overlap, all are equal
-    "six cube faces": _MODES[:1],
-    "20 tangent images (b = 0)": _MODES,
-    "16 horizontal views, 130° and 100°": _MODES,
-    "18 horizontal views of 100°": _MODES,
-    "views like the photos": _MODES,
-}
-"""Corrections that are measured; without `grid`, which takes long, for other views."""
-_SHOWN = "absrel", "delta1", "absrel, median", "delta1, median"
+_CAMERAS = "ignored", "used"
+_UNALIGNED = "equirectangular image", "six cube faces"
+"""Views without overlap, of which all corrections are equal."""
+_WITH_GRID = (
+    "20 tangent images (b = 0)",
+    "16 horizontal views, 130° and 100°",
+    "18 horizontal views of 100°",
+    "views like the photos",
+)
+"""Views with the correction `grid`, which takes long, on rooms."""
 
 
 class Panorama(NamedTuple):
@@ -135,78 +134,70 @@ def scores(prediction: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
 
 
 def measure(
-    loaded: LoadedNetwork, panoramas: Sequence[Panorama], options: Mapping[str, dict[str, Any]]
-) -> list[Row]:
-    """Return the scores of every panorama, with all views and corrections."""
-    rows: list[Row] = []
-    span = 2 * half_width((loaded.photo_fov_deg or (90.0, 90.0))[0])
-    for name, given in options.items():
-        selector = ViewSelector(loaded, **given)
-        for group, image, truth in panoramas:
-            ((source, shape, sets, _),) = selector(image)
-            rendered = RenderedViews(loaded, source, shape, "cpu")
-            with torch.no_grad():
-                outputs = [loaded.network(rendered.of(views)(slice(None))) for views in sets]
-            for camera, mode in product(_CAMERAS, _MODES):
-                if mode not in _MODES_OF.get(name, _MODES[:2]):
-                    continue
-                mosaic = AlignedMosaic(image.shape, _CAMERAS[camera], "feather", mode)
-                for views, output in zip(sets, outputs, strict=True):
-                    mosaic.add(output / (span if camera == "ignored" else 1), views)
-                row: Row = {"data": group, "views": name, "camera": camera, "align": mode}
-                row |= scores(mosaic.pixels(), truth)
-                steps = {key: mosaic.facts[key] for key in ("step_before", "step_after")}
-                rows.append(row | {"number": mosaic.facts["views"]} | steps)
-        for camera in _CAMERAS:
-            print(name, camera, mean_of(rows, name, camera), flush=True)
-    return rows
+    loaded: LoadedNetwork, panoramas: Sequence[Panorama], name: str, given: Mapping[str, Any]
+) -> tuple[list[Row], list[Row]]:
+    """Return the scores of every panorama, and the scale of every view.
 
-
-def mean_of(rows: Sequence[Row], name: str, camera: str) -> str:
-    """Return a short text of the last scores, as progress."""
-    of_last = [row for row in rows if (row["views"], row["camera"]) == (name, camera)]
-    groups = dict.fromkeys((row["data"], row["align"]) for row in of_last)
-    texts = []
-    for group in groups:
-        found = [row for row in of_last if (row["data"], row["align"]) == group]
-        errors = [np.mean([row[score] for row in found]) for score in _SHOWN]
-        texts.append(f"{' '.join(group)} {' '.join(f'{error:.3f}' for error in errors)}")
-    return "; ".join(texts)
-
-
-def scales_of_views(
-    loaded: LoadedNetwork, panoramas: Sequence[Panorama], options: Mapping[str, dict[str, Any]]
-) -> list[Row]:
-    """Return the median ratio of predicted and true distances in a view, by the view's pitch.
+    Args:
+        loaded: The network, whose camera is known.
+        panoramas: The panoramas.
+        name: Name of the views.
+        given: Arguments of `ViewSelector`.
 
     Returns:
-        For every option and pitch the mean and standard deviation over views and panoramas, of
-        views with a known distance in a quarter of their pixels.
+        Rows of scores for both uses of the camera and all corrections. Rows of views with a known
+        distance in a quarter of their pixels: the median ratio of the network's and the true
+        distances, the camera ignored.
     """
-    rows: list[Row] = []
-    plain = replace(loaded, depth_kind="metric_z")
-    for name, given in options.items():
-        ratios: dict[tuple[str, int], list[float]] = {}
-        selector = ViewSelector(plain, **given)
-        for group, image, truth in panoramas:
-            ((source, shape, sets, _),) = selector(image)
-            rendered = RenderedViews(plain, source, shape, "cpu")
-            for views in sets:
-                lengths = torch.from_numpy(views.ray_lengths())
-                with torch.no_grad():
-                    distance = plain.network(rendered.of(views)(slice(None)))[:, 0] * lengths
+    found: list[Row] = []
+    ratios: list[Row] = []
+    selector = ViewSelector(loaded, **given)
+    for group, image, truth in panoramas:
+        ((source, shape, sets, _),) = selector(image)
+        rendered = RenderedViews(loaded, source, shape, "cpu")
+        with torch.no_grad():
+            outputs = [loaded.network(rendered.of(views)(slice(None))) for views in sets]
+        outputs = [output / _span(loaded) for output in outputs]
+        for views, output in zip(sets, outputs, strict=True):
+            if isinstance(views, PinholeViews):
+                distances = output[:, 0] * torch.from_numpy(views.ray_lengths())
                 true = views.render(truth[None], "nearest")[:, 0]
-                heights = np.arcsin(views.rays()[:, 2, 2])
-                for height, d, g in zip(heights, distance, true, strict=True):
+                heights = np.degrees(np.arcsin(views.grid.centers_xyz[:, 2])).round()
+                for height, d, g in zip(heights, distances, true, strict=True):
                     known = g > 0
+                    row: Row = {"data": group, "views": name, "pitch °": int(height)}
                     if known.float().mean() > 0.25:
-                        ratio = float((d / g)[known].nanmedian())
-                        key = group, round(float(np.degrees(height)))
-                        ratios.setdefault(key, []).append(ratio)
-        for (group, height), found in sorted(ratios.items()):
-            mean, spread = float(np.mean(found)), float(np.std(found))
-            row = {"data": group, "views": name, "pitch °": height, "number": len(found)}
-            rows.append(row | {"scale": mean, "spread": spread})
+                        ratios.append(row | {"ratio": float((d / g)[known].median())})
+        modes = _MODES if name in _WITH_GRID and group == "rooms" else _MODES[:2]
+        for camera, mode in product((0, 1), modes[: 1 if name in _UNALIGNED else 3]):
+            mosaic = AlignedMosaic(image.shape, "metric_z", "feather", mode)
+            for views, output in zip(sets, outputs, strict=True):
+                mosaic.add(output * (_span(loaded) / _width(views) if camera else 1), views)
+            used = {"data": group, "views": name, "camera": _CAMERAS[camera], "align": mode}
+            row = used | scores(mosaic.pixels(), truth)
+            steps = {key: mosaic.facts[key] for key in ("step_before", "step_after")}
+            found.append(row | {"number": mosaic.facts["views"]} | steps)
+    return found, ratios
+
+
+def _span(loaded: LoadedNetwork) -> float:
+    """Return the width of the photos of the training at distance 1."""
+    return 2 * half_width((loaded.photo_fov_deg or (90.0, 90.0))[0])
+
+
+def _width(views: Views) -> float:
+    """Return the width of views at distance 1; the radians of an equirectangular image."""
+    return 2 * views.grid.half_size[0] if isinstance(views, PinholeViews) else 2 * math.pi
+
+
+def scales(ratios: Sequence[Row]) -> list[Row]:
+    """Return mean and standard deviation of the ratios of views of one pitch."""
+    rows: list[Row] = []
+    for key in sorted({tuple(row.values())[:3] for row in ratios}):
+        of_key = [row["ratio"] for row in ratios if tuple(row.values())[:3] == key]
+        row = dict(zip(("data", "views", "pitch °"), key, strict=True))
+        row |= {"number": len(of_key), "scale": float(np.mean(of_key))}
+        rows.append(row | {"spread": float(np.std(of_key))})
     return rows
 
 
@@ -244,10 +235,13 @@ def main() -> None:
     given = parser.parse_args()
     loaded = load_network(given.network)
     panoramas = [*rooms(given.rooms), *(homes(given.homes) if given.homes else ())]
-    options = view_options(loaded)
-    save("depth_network", means(measure(loaded, panoramas, options)), digits=3)
-    pinhole = {name: each for name, each in options.items() if "erp" not in each.values()}
-    save("depth_network_scales", scales_of_views(loaded, panoramas, pinhole), digits=3)
+    found: list[Row] = []
+    ratios: list[Row] = []
+    for name, options in view_options(loaded).items():
+        of_name = measure(loaded, panoramas, name, options)
+        found, ratios = found + of_name[0], ratios + of_name[1]
+    save("depth_network", means(found), digits=3)
+    save("depth_network_scales", scales(ratios), digits=3)
 
 
 if __name__ == "__main__":

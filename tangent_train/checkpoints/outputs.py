@@ -112,12 +112,11 @@ class OutputNetwork(nn.Module):
             arguments, settings = cameras_of_rays(arguments[0][0], tile), {}
         images = images if tile == size else _resized(images, tile)
         if self.takes_cameras and not self._takes_all_views:
-            step = batch or len(images)
-            pairs = zip(images.split(step), arguments[1].split(step), strict=True)
-            parts = [named_outputs(self.network(*pair)) for pair in pairs]
+            given = (torch.split(each, batch or len(images)) for each in (images, arguments[1]))
+            parts = [named_outputs(self.network(*part)) for part in zip(*given, strict=True)]
             returned = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
         else:
-            returned = named_outputs(self.network(images, *arguments, **settings))
+            returned = dict(named_outputs(self.network(images, *arguments, **settings)))
         outputs = {n: _with_channels(returned[n]) for n in _MAPS if n in returned}
         outputs["out"] = outputs["out"] * self._gain
         if tile != size:

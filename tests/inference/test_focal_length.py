@@ -101,7 +101,7 @@ class OneSize(nn.Conv2d):
 def imported(path: Path, **settings: Any) -> LoadedNetwork:
     """Return a depth network of images of 32 × 32 pixels, read from its file."""
     torch.manual_seed(0)
-    described = {"in_channels": 3, "out_channels": 1, "kernel_size": 1}
+    described: dict[str, Any] = {"in_channels": 3, "out_channels": 1, "kernel_size": 1}
     module = OneSize(**described)
     named = {"_target_": "tests.inference.test_focal_length.OneSize", **described}
     photo_network = PhotoNetwork(module, named, (), UNIT, (32, 32), depth_kind="metric_z")
