@@ -323,6 +323,29 @@ def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
     _write_json(path, content)
 
 
+class _Pose(BaseModel):
+    file: str
+    location: tuple[float, float, float]
+    world_from_panorama: _Rotation
+
+
+class _PosesJson(BaseModel):
+    panoramas: list[_Pose]
+
+
+def read_poses(path: Path) -> dict[str, PanoramaPose]:
+    """Read poses that `write_poses` wrote.
+
+    Raises:
+        DataError: The file is missing, or has other content.
+    """
+    content: _PosesJson = read_json(path, "poses as of tangent-render poses=", kind=_PosesJson)
+    return {
+        pose.file: PanoramaPose(to_right_handed(pose.world_from_panorama), pose.location)
+        for pose in content.panoramas
+    }
+
+
 def _write_json(path: Path, content: Any) -> None:
     text = json.dumps(content, indent=1, ensure_ascii=False)
     write_text(path, _NUMBERS.sub(lambda match: " ".join(match[0].split()), text) + "\n")

@@ -103,7 +103,8 @@ def import_network(
         kind = score_kind or network.score_kind or usual_kind(output, len(network.score_names))
         count = output.shape[1]
         names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
-        described = {"class_names": names, "groups": groups, "score_kind": kind}
+        things = tuple(name for name in map(composed, network.things) if name in names)
+        described = {"class_names": names, "groups": groups, "score_kind": kind, "things": things}
     camera = None if fov_deg is None else _both_fov_deg(fov_deg, size)
     depth_kind = network.depth_kind
     if depth_kind == "metric_z" and camera is not None:
