@@ -55,7 +55,7 @@ class OutputNetwork(nn.Module):
     Attributes:
         num_outputs: Number of channels of the converted output, with `groups` their number.
         tile: See above.
-        takes_cameras: True if the network takes all views of a panorama with their cameras.
+        takes_cameras: See `takes_cameras`.
     """
 
     def __init__(
@@ -146,6 +146,11 @@ def plain_output(returned: Any) -> Tensor:
     return named_outputs(returned)["out"]
 
 
+def takes_cameras(network: nn.Module) -> bool:
+    """Return True if a network takes all views of a panorama in one call, with their cameras."""
+    return isinstance(network, OutputNetwork) and network.takes_cameras
+
+
 def example_inputs(network: nn.Module, images: Tensor) -> tuple[Tensor, ...]:
     """Return images ``(B, C, h, w)`` with the rays of views straight ahead, if cameras are taken.
 
@@ -153,7 +158,7 @@ def example_inputs(network: nn.Module, images: Tensor) -> tuple[Tensor, ...]:
         network: `LoadedNetwork.network`, or an `OutputNetwork`.
         images: Images to test the network with.
     """
-    if not getattr(network, "takes_cameras", False):
+    if not takes_cameras(network):
         return (images,)
     return images, torch.eye(3).expand(1, len(images), 3, 3)
 

@@ -19,7 +19,7 @@ from tangent_train.checkpoints.loaded import (
     load_network,
     write_onnx_description,
 )
-from tangent_train.checkpoints.outputs import example_inputs, plain_output
+from tangent_train.checkpoints.outputs import example_inputs, plain_output, takes_cameras
 from tangent_train.errors import SettingError, check_choice, first_line, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.imports import hide_output
@@ -86,7 +86,7 @@ def export_network(
         failure = "an exported network contains only the computation"
     elif is_onnx and is_aware:
         failure = "distortion-aware convolutions would be right for one size only"
-    elif is_onnx and getattr(loaded.network, "takes_cameras", False):
+    elif is_onnx and takes_cameras(loaded.network):
         failure = "an ONNX file takes images without their cameras"
     for size in sizes if failure is None else ():
         try:
