@@ -69,6 +69,7 @@ class NetworkDescription:
             trained on; None for other networks.
         groups: Indices of a photo network's scores for each class, and in a last group those of no
             class: where they win, the label is 0. None if each score is a class.
+        things: Names of the classes of which the network returns objects, see `Segments`.
         score_kind: Kind of the output of a network of classes.
         depth_kind: Kind of the output of a depth network; None for networks of classes.
         fill: Colors outside the area of partial panoramas in the training.
@@ -87,6 +88,7 @@ class NetworkDescription:
     fixed_size: _Size | None = None
     photo_level: int | None = None
     groups: tuple[tuple[int, ...], ...] | None = None
+    things: tuple[str, ...] = ()
     score_kind: ScoreKind = "logits"
     depth_kind: DepthKind | None = None
     fill: Fill = "mean"

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.distortion_aware import make_distortion_aware
+from models.segments import Segments
 from tangent_train.checkpoints.cameras import cameras_of_rays, rotation_error_deg
 from tangent_train.errors import SettingError
 from tangent_train.kinds import ScoreKind
@@ -77,7 +78,9 @@ class OutputNetwork(nn.Module):
         """Return the converted output ``(B, num_outputs, h, w)``.
 
         A depth network that returns a confidence or rotations yields a dict: the output under
-        ``"out"``, ``"confidence"`` ``(B, 1, h, w)`` and ``"rotation_error_deg"``.
+        ``"out"``, ``"confidence"`` ``(B, 1, h, w)`` and ``"rotation_error_deg"``. So does a network
+        of classes that returns objects: ``"segments"``, a list of `Segments`, whose classes become
+        those of the output. Tiles have no objects.
 
         Args:
             images: Normalized images ``(B, C, h, w)``.
@@ -113,14 +116,26 @@ class OutputNetwork(nn.Module):
             outputs["rotation_error_deg"] = error
         return outputs if len(outputs) > 1 else outputs["out"]
 
-    def _scores(self, kind: ScoreKind, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
-        outputs = plain_output(self.network(images, *arguments, **settings))
-        groups = self._groups
+    def _scores(self, kind: ScoreKind, images: Tensor, *arguments: Any, **settings: Any) -> Any:
+        returned = named_outputs(self.network(images, *arguments, **settings))
+        outputs, groups = returned["out"], self._groups
         last = self.num_outputs - 1 if groups is None else max(k for group in groups for k in group)
         scores = as_logits(outputs, kind, last)
-        if groups is None:
+        if groups is not None:
+            scores = torch.cat([_sum(scores, group) for group in groups], dim=1)
+        if "segments" not in returned:
             return scores
-        return torch.cat([_sum(scores, group) for group in groups], dim=1)
+        segments = [_regrouped(each, groups) for each in returned["segments"]]
+        return {"out": scores, "segments": segments}
+
+
+def _regrouped(segments: Segments, groups: Groups | None) -> Segments:
+    """Return objects with the number of the group of their class; −1 for none."""
+    if groups is None:
+        return segments
+    group_of = {k: number for number, group in enumerate(groups) for k in group}
+    found = [group_of.get(k, -1) for k in segments.classes.tolist()]
+    return segments._replace(classes=torch.tensor(found).to(segments.classes))
 
 
 def network_for_views(network: nn.Module, distortion_aware: bool | None) -> nn.Module:
@@ -214,7 +229,7 @@ def _resized(images: Tensor, size: Any) -> Tensor:
 
 
 def _mean_of_tiles(
-    network: Callable[[Tensor], Tensor], images: Tensor, tile: tuple[int, int]
+    network: Callable[[Tensor], Any], images: Tensor, tile: tuple[int, int]
 ) -> Tensor:
     """Return the mean scores of evenly spaced tiles that cover larger images."""
     tops, lefts = (
@@ -224,7 +239,7 @@ def _mean_of_tiles(
     total, count = torch.zeros(()), images.new_zeros((len(images), 1, *images.shape[-2:]))
     for top, left in itertools.product(tops, lefts):
         area = (..., slice(top, top + tile[0]), slice(left, left + tile[1]))
-        scores = network(images[area])
+        scores = plain_output(network(images[area]))
         if not total.ndim:
             total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
         total[area] += scores

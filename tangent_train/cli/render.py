@@ -10,18 +10,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from datamodules.folder.class_masks import mask_reader
 from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted
+from tangent_train.errors import DataError, SettingError, counted, listed
 from tangent_train.files import check_new
 from tangent_train.geometry import (
+    PanoramaPose,
     PinholeGrid,
     TangentGrid,
     nearest_level,
     perspective_grid,
+    to_right_handed,
     view_rotation,
 )
 from tangent_train.geometry.camera import half_width
@@ -30,6 +34,7 @@ from tangent_train.io.camera_files import (
     CAMERAS_FILE,
     RIG_FILE,
     CameraFile,
+    View,
     read_cameras,
     read_rig,
     write_cameras,
@@ -37,8 +42,10 @@ from tangent_train.io.camera_files import (
     write_rig,
 )
 from tangent_train.io.gpano import eye_part, read_area, read_tags, shape_of
+from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.jobs import Inputs, Job, work_on
-from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_image_size, write_pixels
+from tangent_train.io.nerfstudio import write_transforms, write_z_depth
+from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_depth_m, read_image_size, write_pixels
 from tangent_train.io.tangent_folders import (
     TangentResults,
     face_name,
@@ -48,10 +55,11 @@ from tangent_train.io.tangent_folders import (
     write_views,
 )
 from tangent_train.io.videos import read_video_tags
-from tangent_train.keypoints.colmap import panorama_poses
+from tangent_train.keypoints.colmap import model_points, poses_from
 from tangent_train.manifest import Manifest
 from tangent_train.rendering.figure import tangent_figure
 from tangent_train.rendering.representations.pinhole import ring_size
+from tangent_train.rendering.resampling import resize
 
 
 def render(settings: RenderSettings) -> None:
@@ -62,12 +70,14 @@ def render(settings: RenderSettings) -> None:
         SettingError: A setting is invalid, or the output was written with other settings.
     """
     modes = [name for name in _MODES if getattr(settings, name) is not None]
+    modes = ["input"] if settings.nerfstudio else modes
     if len(modes) != 1 or (settings.output or settings.figure) is None:
         found = " and ".join(modes) or "none of them"
         expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>, and output="
         remedy = "Example: tangent-render input=panoramas output=tangent"
         raise SettingError("input, back and poses", found=found, expected=expected, remedy=remedy)
     run, read = _MODES[modes[0]]
+    read = read | (_OF_NERFSTUDIO if settings.nerfstudio else set())
     check_read(settings, {*read, *modes, "output", "overwrite"})
     run(settings, settings.model_dump(mode="json", exclude={*settings.not_content}))
 
@@ -85,7 +95,10 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         raise SettingError("format", found=settings.format, expected=expected)
     cameras = _cameras(settings, 512)  # refuses views before any panorama
     names, masks = inputs.names, mask_reader(None, None)
-    if settings.colmap:  # a camera has images of one size
+    is_project = settings.colmap or settings.nerfstudio
+    poses = _poses(settings, names) if settings.nerfstudio else {}
+    distances = NamedFiles(settings.depth) if settings.depth else None
+    if is_project:  # a camera has images of one size
         rows = _most_rows(settings, inputs)
         cameras = _cameras(settings, rows)
         masks = mask_reader(settings.mask, settings.mask_classes)
@@ -97,13 +110,18 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         source = job.path, kind, settings.area, job.value, settings.depth_channel, settings.eye
         image, area = read_placed(*source)
         shape = image.shape[0], image.shape[1]
-        if settings.colmap:
+        if is_project:
             end = f"{flat_name(job.name)}{suffix}"
-            images = {output / "images" / (prefix + end): view for prefix, view in rig.items()}
+            images, of_images, depths = (
+                {output / folder / (prefix + name): view for prefix, view in rig.items()}
+                for folder, name in (("images", end), ("masks", end + ".png"), ("depths", end))
+            )
             write_views(image, images, kind, progress)
-            counts = masks(job.name, area)
-            of_images = {output / "masks" / f"{p}{end}.png": view for p, view in rig.items()}
-            write_views(counts, of_images, "nearest", lambda _: None)
+            write_views(masks(job.name, area), of_images, "nearest", lambda _: None)
+            if distances is not None:
+                path = find_depth(distances, job.name.removesuffix(job.path.suffix), "")
+                depth = read_depth_m(path, settings.depth_scale, settings.depth_channel)
+                write_z_depth(area.place(resize(depth, area.image_shape, "nearest")), depths)
             return
         of_panorama = replace(_cameras(settings, shape[0]), source=job.path.name, shape=shape)
         folder, views = output / job.name, of_panorama.views
@@ -112,11 +130,38 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         write_cameras(folder / CAMERAS_FILE, of_panorama)
 
     failed = _render_missing(manifest, names, inputs.jobs, work)
-    if settings.colmap:
+    if is_project:
         done = {name: manifest.finished[name] for name in names if name in manifest.finished}
         panoramas = {f"{flat_name(name)}{suffix}": item["file"] for name, item in done.items()}
         write_rig(output / RIG_FILE, rig, panoramas)
+        if settings.nerfstudio:
+            posed = {end: poses.get(file) or poses.get("") for end, file in panoramas.items()}
+            _write_transforms(settings, output, rig, posed)
     _print_written(output, names, failed)
+
+
+def _write_transforms(
+    settings: RenderSettings,
+    output: Path,
+    rig: Mapping[str, View],
+    poses: Mapping[str, PanoramaPose | None],
+) -> None:
+    """Write Nerfstudio's cameras, of the panoramas that have a pose, and points."""
+    frames = {p + end: (rig[p], pose) for end, pose in poses.items() if pose for p in rig}
+    if missing := [end for end, pose in poses.items() if pose is None]:
+        print_text(f"Without a pose, and left out: {listed(missing)}")
+    is_model = settings.poses is not None and settings.poses.is_dir()
+    write_transforms(output, frames, model_points(settings.poses or Path()) if is_model else None)
+
+
+def _poses(settings: RenderSettings, names: Sequence[str]) -> dict[str, PanoramaPose]:
+    """Return poses of panoramas by file; a single one, called "", defines the world."""
+    if settings.poses is not None:
+        return poses_from(settings.poses, settings.cameras)
+    if len(names) > 1:
+        expected = f"poses of the {len(names)} panoramas: a COLMAP model, or a JSON file"
+        raise SettingError("poses", found="null", expected=expected)
+    return {"": PanoramaPose(to_right_handed(np.eye(3)), np.zeros(3))}
 
 
 def _render_missing(
@@ -226,7 +271,7 @@ def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
     model, output = settings.poses or Path(), settings.output or Path()
     check_new(output, overwrite=settings.overwrite)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
-    poses = panorama_poses(model, rig)
+    poses = poses_from(model, settings.cameras)
     write_poses(output, poses)
     count = counted(len(rig.panoramas), "panoramas")
     print_text(f"Written: {output}, poses of {len(poses)} of {count}")
@@ -286,6 +331,8 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
+
+_OF_NERFSTUDIO = {"nerfstudio", "poses", "cameras", "depth", "depth_scale"}
 
 _SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
 

@@ -247,13 +247,23 @@ class RenderSettings(ImageSettings):
     colmap: bool = False
     """true: write one COLMAP project for all panoramas: images, masks and rig_config.json"""
     mask: OneOrMore[float | ExistingPath] | None = None
-    """colmap=true: ignored pixels: below a latitude (-60), black in a PNG file, or in a folder of
-    one file per panorama; also several, e.g. [-60,tripod.png]; null = none"""
+    """colmap=true or nerfstudio=true: ignored pixels: below a latitude (-60), black in a PNG file,
+    or in a folder of one file per panorama; also several, e.g. [-60,tripod.png]; null = none"""
     mask_classes: OneOrMore[str] | None = None
     """ignored classes, e.g. [person], with mask= a folder that tangent-predict wrote (labels/,
     classes.json)"""
     poses: ExistingPath | None = None
-    """folder of a sparse COLMAP model, whose poses of panoramas are written as JSON"""
+    """folder of a sparse COLMAP model, whose poses of panoramas are written as JSON; with
+    nerfstudio=true, it or the JSON file"""
+
+    # --- Nerfstudio ---
+    nerfstudio: bool = False
+    """true: write a project as colmap=true, with transforms.json, z-depth and sparse_pc.ply for
+    splats; several panoramas need poses="""
+    depth: ExistingPath | None = None
+    """nerfstudio=true: folder of distances, as tangent-predict writes (depth/); null = no depth"""
+    depth_scale: PositiveFloat = 1000
+    """nerfstudio=true: units per meter in depth files of whole numbers"""
 
     # --- back to panoramas ---
     back: ExistingPath | None = None

@@ -30,7 +30,7 @@ class PinholeGrid:
     """N pinhole images of the same size and pitch around a common center.
 
     Pixel (row i, column j) of an image sits on the plane at distance 1 in front of the camera, at
-    ``(j − (w−1)/2)·p`` to the right and ``(i − (h−1)/2)·p`` down. Every direction is *owned* by the
+    ``(j − (w−1)/2)·p`` to the right and ``(i − (h−1)/2)·q`` down. Every direction is *owned* by the
     image with the nearest center. Where the owners show all directions that they own, a direction
     lies at most half a pixel outside the outermost pixel centers of its owner.
 
@@ -40,6 +40,7 @@ class PinholeGrid:
         size: Rows h and columns w of the images.
         pitch: Distance p of neighboring pixels on the image plane, in focal lengths.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
+        row_pitch: Distance q of neighboring rows; None for p, square pixels.
         is_overlapping: True if every direction is inside an image, not only on its outer edge.
         is_complete: True if the images are known to cover the area that is rendered back; False to
             check the coverage at that time.
@@ -55,12 +56,14 @@ class PinholeGrid:
         pitch: float,
         rotation: ArrayLike | None = None,
         *,
+        row_pitch: float | None = None,
         is_overlapping: bool = True,
         is_complete: bool = False,
     ) -> None:
         self._axes = axes
         self.size = _checked_size(size)
         self.pitch = pitch
+        self.row_pitch = row_pitch or pitch
         self.rotation = None if rotation is None else checked_rotation(rotation)
         self.is_overlapping = is_overlapping
         self.is_complete = is_complete
@@ -98,9 +101,13 @@ class PinholeGrid:
         Use it for the output of a network that downsamples or upsamples images.
 
         Args:
-            size: Rows h' and columns w', with w'/h' = w/h; the pitch becomes p·w/w'.
+            size: Rows h' and columns w'; the pitches become p·w/w' and q·h/h'.
         """
-        return self._changed(size=size, pitch=self.pitch * self.size[1] / size[1])
+        row_pitch, pitch = (
+            pitch * before / after
+            for pitch, before, after in zip(self.pitches[::-1], self.size, size, strict=True)
+        )
+        return self._changed(size=size, pitch=pitch, row_pitch=row_pitch)
 
     def subset(self, faces: Faces) -> Self:
         """Return some of the images; the nearest among them owns a direction.
@@ -124,10 +131,15 @@ class PinholeGrid:
         return self.size[0]
 
     @property
+    def pitches(self) -> tuple[float, float]:
+        """Distances p of columns and q of rows on the image plane, in focal lengths."""
+        return self.pitch, self.row_pitch
+
+    @property
     def half_size(self) -> tuple[float, float]:
         """Positions x and y of the outer pixel edges on the image plane."""
         rows, columns = self.size
-        return columns * self.pitch / 2, rows * self.pitch / 2
+        return columns * self.pitch / 2, rows * self.row_pitch / 2
 
     @property
     def half_extent(self) -> float:
@@ -146,9 +158,9 @@ class PinholeGrid:
 
     @property
     def camera_matrix(self) -> NDArray[np.float64]:
-        """``(3, 3)`` pinhole matrix of every image: focal length 1/p, center (w−1)/2, (h−1)/2."""
+        """``(3, 3)`` pinhole matrix of every image: focal lengths 1/p, 1/q, center (w−1)/2, …."""
         y, x = ((side - 1) / 2 for side in self.size)
-        return np.array([[1 / self.pitch, 0, x], [0, 1 / self.pitch, y], [0, 0, 1]])
+        return np.array([[1 / self.pitch, 0, x], [0, 1 / self.row_pitch, y], [0, 0, 1]])
 
     @property
     def centers_xyz(self) -> NDArray[np.float64]:
@@ -175,7 +187,10 @@ class PinholeGrid:
         Returns:
             ``(n, h, w, 3)`` unit vectors.
         """
-        rows, columns = ((np.arange(side) - (side - 1) / 2) * self.pitch for side in self.size)
+        rows, columns = (
+            (np.arange(side) - (side - 1) / 2) * pitch
+            for side, pitch in zip(self.size, self.pitches[::-1], strict=True)
+        )
         x, y = np.meshgrid(columns, rows)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -227,7 +242,7 @@ class PinholeGrid:
         axes = self.world_from_camera[np.asarray(faces)]
         points = np.einsum("...w,...wc->...c", np.asarray(directions_xyz, np.float64), axes)
         depth = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-        return points[..., :2] / depth / self.pitch + self.camera_matrix[:2, 2]
+        return points[..., :2] / depth / self.pitches + self.camera_matrix[:2, 2]
 
     def insets(self, directions_xyz: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the distances of directions from the edges of the images.
@@ -251,7 +266,7 @@ class PinholeGrid:
     @cached_property
     def _key(self) -> tuple[object, ...]:
         rotation = None if self.rotation is None else self.rotation.tobytes()
-        return self._axes.tobytes(), self.size, self.pitch, rotation, self.is_overlapping
+        return self._axes.tobytes(), self.size, self.pitches, rotation, self.is_overlapping
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PinholeGrid) and self._key == other._key
@@ -391,10 +406,12 @@ class RingGrid(PinholeGrid):
     Args:
         rings: Rings, each with ``pitch`` in degrees (−90 to 90) and its number of ``views``.
         fov_deg: Least horizontal and vertical field of view in degrees, between the outer pixel
-            edges. Pixels are square: if `size` has another ratio, one field of view is larger.
+            edges.
         size: Rows and columns of the images.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         valid: ``(H, W)`` pixels of a panorama that the images must cover; None for the sphere.
+        square_pixels: True for square pixels: if `size` has another ratio, one field of view is
+            larger. False for exactly that field of view, stretched to `size`.
         by_owners: False if images may be blended with ``feather`` only, see `check_coverage`.
         is_complete: False for images that do not cover these pixels without other grids.
 
@@ -415,14 +432,17 @@ class RingGrid(PinholeGrid):
         rotation: ArrayLike | None = None,
         valid: NDArray[np.bool_] | None = None,
         *,
+        square_pixels: bool = True,
         by_owners: bool = True,
         is_complete: bool = True,
     ) -> None:
         across, down = map(half_width, _pair("fov_deg", fov_deg))
         rows, columns = _checked_size(size)
-        pitch = max(2 * across / columns, 2 * down / rows)
+        pitches = 2 * across / columns, 2 * down / rows
+        pitch, row_pitch = (max(pitches),) * 2 if square_pixels else pitches
         axes = _upright_axes(lonlat_to_xyz(np.radians(_ring_centers(rings))))
-        super().__init__(axes, (rows, columns), pitch, rotation, is_complete=is_complete)
+        kinds: Any = {"row_pitch": row_pitch, "is_complete": is_complete}
+        super().__init__(axes, (rows, columns), pitch, rotation, **kinds)
         resting = self.with_rotation(None)
         check_type("valid", valid, (np.ndarray, type(None)), "an array of booleans")
         if is_complete:

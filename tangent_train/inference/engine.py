@@ -319,6 +319,8 @@ class Predictor:
         joins = takes_cameras(self._loaded.network)
         for views, scores, outputs in scored_views(network, sets, per_forward, joins):
             mosaic.add(scores, views)
+            if "segments" in outputs and hasattr(mosaic, "add_segments"):
+                mosaic.add_segments(outputs["segments"], views)
             if "rotation_error_deg" in outputs:
                 mosaic.facts["rotation_error_deg"] = outputs["rotation_error_deg"]
             progress(len(views) / count)

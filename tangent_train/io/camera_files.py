@@ -117,8 +117,10 @@ class _CamerasJson(BaseModel):
         if self.camera is None:
             raise ValueError("views of several fields of view, which cannot be rendered back")
         axes = np.stack([to_right_handed(np.transpose(view)).T for view in self.views])
-        size, focal = (self.camera.height, self.camera.width), self.camera.matrix[0][0]
-        return PinholeGrid(axes, size, 1 / focal, is_overlapping=self.overlapping)
+        size = self.camera.height, self.camera.width
+        pitch, row_pitch = (1 / self.camera.matrix[axis][axis] for axis in (0, 1))
+        kinds: Any = {"row_pitch": row_pitch, "is_overlapping": self.overlapping}
+        return PinholeGrid(axes, size, pitch, **kinds)
 
 
 @dataclass(frozen=True)
@@ -283,7 +285,7 @@ def write_rig(path: Path, views: Mapping[str, View], panoramas: Mapping[str, str
                 "image_prefix": prefix,
                 **({"ref_sensor": True} if prefix == first else of_rig),
                 "camera_model_name": "PINHOLE",
-                "camera_params": (1 / grid.pitch, 1 / grid.pitch, columns / 2, rows / 2),
+                "camera_params": (1 / grid.pitch, 1 / grid.row_pitch, columns / 2, rows / 2),
                 "world_from_camera": axes,
             }
         )
@@ -319,6 +321,29 @@ def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
     ]
     content = {"format": "panorama poses", "conventions": _POSES, "panoramas": panoramas}
     _write_json(path, content)
+
+
+class _Pose(BaseModel):
+    file: str
+    location: tuple[float, float, float]
+    world_from_panorama: _Rotation
+
+
+class _PosesJson(BaseModel):
+    panoramas: list[_Pose]
+
+
+def read_poses(path: Path) -> dict[str, PanoramaPose]:
+    """Read poses that `write_poses` wrote.
+
+    Raises:
+        DataError: The file is missing, or has other content.
+    """
+    content: _PosesJson = read_json(path, "poses as of tangent-render poses=", kind=_PosesJson)
+    return {
+        pose.file: PanoramaPose(to_right_handed(pose.world_from_panorama), pose.location)
+        for pose in content.panoramas
+    }
 
 
 def _write_json(path: Path, content: Any) -> None:

@@ -102,12 +102,12 @@ def write_views(
     """
     reduced: dict[float, NDArray[Any]] = {}
     if interpolation == "bilinear":
-        pitches = {grid.pitch for grid, _ in files.values()}
+        pitches = {min(grid.pitches) for grid, _ in files.values()}
         reduced = {pitch: reduce_to_pitch(image, pitch) for pitch in pitches}
 
     def write(item: tuple[Path, View]) -> None:
         path, (grid, face) = item
-        source = reduced.get(grid.pitch, image)
+        source = reduced.get(min(grid.pitches), image)
         (pixels,) = equirect_to_tangent(source, grid, [face], interpolation)
         pixel_files.write_pixels(path, pixels)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
 from tangent_train.geometry import PanoramaPose, to_right_handed
-from tangent_train.io.camera_files import RigFile
+from tangent_train.io.camera_files import RIG_FILE, RigFile, read_poses, read_rig
 from tangent_train.keypoints.features import SphericalKeypoints
 from tangent_train.keypoints.two_view import TwoView, colmap, rigid_matrix
 
@@ -95,6 +95,29 @@ def _geometry(pairs: NDArray[np.uint32], found: TwoView) -> Any:
     if found.translation is not None:
         geometry.E = pycolmap.essential_matrix_from_pose(geometry.cam2_from_cam1)
     return geometry
+
+
+def poses_from(path: Path, project: Path | None = None) -> dict[str, PanoramaPose]:
+    """Read poses of panoramas, by file, from a JSON file or a sparse COLMAP model.
+
+    Args:
+        path: File of `write_poses`, or folder of the model.
+        project: Folder with the rig of the model; None for two folders above it.
+
+    Raises:
+        DataError: A file cannot be read, or the model contains no panorama of the project.
+        SettingError: pycolmap is missing.
+    """
+    if path.is_file():
+        return read_poses(path)
+    return panorama_poses(path, read_rig((project or path.absolute().parent.parent) / RIG_FILE))
+
+
+def model_points(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return the points ``(n, 3)`` of a sparse COLMAP model, and their RGB colors."""
+    points = colmap().Reconstruction(model).points3D.values()
+    xyz = np.array([point.xyz for point in points]).reshape(-1, 3)
+    return xyz, np.array([point.color for point in points], np.uint8).reshape(-1, 3)
 
 
 def panorama_poses(model: Path, rig: RigFile) -> dict[str, PanoramaPose]:

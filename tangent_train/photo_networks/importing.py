@@ -96,7 +96,8 @@ def import_network(
         kind = score_kind or network.score_kind or usual_kind(output, len(network.score_names))
         count = output.shape[1]
         names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
-        described = {"class_names": names, "groups": groups, "score_kind": kind}
+        things = tuple(name for name in map(composed, network.things) if name in names)
+        described = {"class_names": names, "groups": groups, "score_kind": kind, "things": things}
     # A network of a fixed size gets square images of its longer side, see `NetworkDescription`.
     seen = photo_network_settings(max(size) if fixed else min(size), levels, base_level, views)
     loaded = LoadedNetwork(

@@ -78,7 +78,7 @@ def equirect_to_tangent(
     check_panorama(image, interpolation)
     check_grid(grid)
     if interpolation == "bilinear":
-        image = reduce_to_pitch(image, grid.pitch)
+        image = reduce_to_pitch(image, min(grid.pitches))
     indices, (rows, columns) = grid.face_indices(faces), grid.size
     if is_tensor(image):
         from tangent_train.rendering.tensors import render_tensor

@@ -53,7 +53,7 @@ def traced(
         pixels,
         torch.as_tensor(grid._axes),
         rotation,
-        grid.pitch,
+        list(grid.pitches),
         list(grid.size),
         kinds,
         name,
@@ -71,34 +71,34 @@ def _renderer(name: str) -> Callable[..., Tensor]:
 def _grid(
     axes: bytes,
     rotation: bytes | None,
-    pitch: float,
+    pitches: tuple[float, ...],
     size: tuple[int, int],
     kinds: tuple[bool, ...],
 ) -> PinholeGrid:
     matrices = np.frombuffer(axes).reshape(-1, 3, 3)
     rotated = None if rotation is None else np.frombuffer(rotation).reshape(3, 3)
     named = dict(zip(("is_overlapping", "is_complete"), kinds, strict=True))
-    return PinholeGrid(matrices, size, pitch, rotated, **named)
+    return PinholeGrid(matrices, size, pitches[0], rotated, row_pitch=pitches[1], **named)
 
 
 @torch.library.custom_op("tangent_train::render", mutates_args=())
 def _render(
-    pixels: Tensor, axes: Tensor, rotation: Tensor | None, pitch: float, size: list[int],
+    pixels: Tensor, axes: Tensor, rotation: Tensor | None, pitches: list[float], size: list[int],
     kinds: list[bool], name: str, numbers: list[int] | None, options: str,
 ) -> Tensor:  # fmt: skip
     """Call a function of `tangent_train.rendering`."""
     turned = None if rotation is None else rotation.numpy(force=True).tobytes()
     sides = (size[0], size[1])
-    grid = _grid(axes.numpy(force=True).tobytes(), turned, pitch, sides, tuple(kinds))
+    grid = _grid(axes.numpy(force=True).tobytes(), turned, (*pitches,), sides, (*kinds,))
     return _renderer(name)(pixels.detach(), grid, numbers, *options.split()).contiguous()
 
 
 @_render.register_fake
 def _(
-    pixels: Tensor, axes: Tensor, rotation: Tensor | None, pitch: float, size: list[int],
+    pixels: Tensor, axes: Tensor, rotation: Tensor | None, pitches: list[float], size: list[int],
     kinds: list[bool], name: str, numbers: list[int] | None, options: str,
 ) -> Tensor:  # fmt: skip
-    del rotation, pitch, kinds, options
+    del rotation, pitches, kinds, options
     if name == "equirect_to_tangent":
         count = len(axes) if numbers is None else len(numbers)
         return pixels.new_empty((*pixels.shape[:-3], count, pixels.shape[-3], *size))
@@ -110,13 +110,13 @@ def _(
 
 @torch.library.custom_op("tangent_train::render_gradient", mutates_args=())
 def _gradient(
-    gradient: Tensor, shape: list[int], axes: Tensor, rotation: Tensor | None, pitch: float,
+    gradient: Tensor, shape: list[int], axes: Tensor, rotation: Tensor | None, pitches: list[float],
     size: list[int], kinds: list[bool], name: str, numbers: list[int] | None, options: str,
 ) -> Tensor:  # fmt: skip
     """Return the gradient of the pixels; rendering is linear in them."""
     turned = None if rotation is None else rotation.numpy(force=True).tobytes()
     sides = (size[0], size[1])
-    grid = _grid(axes.numpy(force=True).tobytes(), turned, pitch, sides, tuple(kinds))
+    grid = _grid(axes.numpy(force=True).tobytes(), turned, (*pitches,), sides, (*kinds,))
 
     def differentiate() -> Tensor:
         pixels = gradient.new_zeros(shape).requires_grad_()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from tangent_train.geometry import (
@@ -195,8 +196,11 @@ def test_the_missing_part_of_a_panorama_is_ignored(tmp_path: Path) -> None:
 # Poses.
 
 
-def test_poses_of_panoramas_are_those_of_their_images(project: Path, tmp_path: Path) -> None:
-    """A model whose panoramas stand where we say: x to the middle column, y to its left, z up."""
+POINTS = np.random.default_rng(6).normal(0, 3, (50, 3))
+
+
+def _write_model(project: Path, folder: Path) -> dict[str, tuple[Any, Any]]:
+    """Write a model with `POINTS`; return axes and location of its panoramas by file."""
     first = json.loads((project / "rig_config.json").read_text())[0]["cameras"][0]
     rng = np.random.default_rng(5)
     model, true = pycolmap.Reconstruction(), {}
@@ -216,8 +220,16 @@ def test_poses_of_panoramas_are_those_of_their_images(project: Path, tmp_path: P
                 model.add_image(image)
             model.register_frame(frame.frame_id)
             true[images[0].name.partition("/")[2].replace("__", "/")] = axes, location
-    (tmp_path / "model").mkdir()
-    model.write(tmp_path / "model")
+    for point in POINTS:
+        model.add_point3D(point, pycolmap.Track(), np.array([10, 20, 30], np.uint8))
+    folder.mkdir()
+    model.write(folder)
+    return true
+
+
+def test_poses_of_panoramas_are_those_of_their_images(project: Path, tmp_path: Path) -> None:
+    """A model whose panoramas stand where we say: x to the middle column, y to its left, z up."""
+    true = _write_model(project, tmp_path / "model")
     found = panorama_poses(tmp_path / "model", read_rig(project / "rig_config.json"))
     assert found.keys() == true.keys() == set(NAMES)
     directions = random_directions(20)
@@ -226,6 +238,23 @@ def test_poses_of_panoramas_are_those_of_their_images(project: Path, tmp_path: P
         # In this package y is to the right of the middle column.
         expected = location + 3 * (directions * (1, -1, 1)) @ axes.T
         np.testing.assert_allclose(points, expected, atol=1e-9)
+
+
+def test_a_model_gives_poses_and_points_to_nerfstudio(
+    project: Path, panoramas: Path, tmp_path: Path
+) -> None:
+    true = _write_model(project, tmp_path / "model")
+    given = {"poses": tmp_path / "model", "cameras": project, "base_level": 0, "faces": [3]}
+    render_with(input=panoramas, output=tmp_path / "splat", nerfstudio=True, **given)
+    content = json.loads((tmp_path / "splat" / "transforms.json").read_text())
+    for frame, name in zip(content["frames"], FRAMES, strict=True):
+        assert frame["file_path"] == f"images/face_003/{name}"
+        location = np.array(frame["transform_matrix"])[:3, 3]
+        np.testing.assert_allclose(location, true[name.replace("__", "/")][1], atol=1e-9)
+    cloud = trimesh.load(tmp_path / "splat" / content["ply_file_path"])
+    order = np.argsort(cloud.vertices[:, 0])
+    np.testing.assert_allclose(cloud.vertices[order], POINTS[np.argsort(POINTS[:, 0])], atol=1e-6)
+    assert (cloud.colors[:, :3] == (10, 20, 30)).all()
 
 
 # Refused settings.

@@ -19,6 +19,7 @@ from tangent_train.geometry import (
     RingGrid,
     TangentGrid,
     equirect_directions,
+    lonlat_to_xyz,
     rotation_about,
     xyz_to_lonlat,
 )
@@ -42,6 +43,27 @@ def test_project_is_the_inverse_of_directions(rotation: NDArray[np.float64] | No
     assert grid.directions([]).shape == (0, 20, 20, 3)
 
 
+def test_pixels_need_not_be_square() -> None:
+    """Closed form of a camera with two focal lengths, which looks up at a longitude of 90°."""
+    size, fov_deg, up_deg = (30, 40), (62, 48), 36
+    rings = [{"pitch": up_deg, "views": 4}]
+    grid = RingGrid(rings, fov_deg, size, square_pixels=False, is_complete=False)
+    for lon_deg, lat_deg in ((90, 36), (75, 20), (112, 55)):
+        lon, lat, up = np.radians((lon_deg - 90, lat_deg, up_deg))
+        ahead = math.cos(lat) * math.cos(lon)
+        z = ahead * math.cos(up) + math.sin(lat) * math.sin(up)
+        x, y = math.cos(lat) * math.sin(lon), ahead * math.sin(up) - math.sin(lat) * math.cos(up)
+        focal = [n / 2 / math.tan(math.radians(fov / 2)) for n, fov in ((40, 62), (30, 48))]
+        expected = focal[0] * x / z + 39 / 2, focal[1] * y / z + 29 / 2
+        found = grid.project(lonlat_to_xyz(np.radians((lon_deg, lat_deg))), 1)
+        np.testing.assert_allclose(found, expected, atol=1e-11)
+    rows, columns = np.mgrid[:30, :40]
+    pixels = grid.project(grid.directions([1])[0], 1)
+    np.testing.assert_allclose(pixels, np.stack([columns, rows], axis=-1), atol=1e-11)
+    assert np.degrees(2 * np.arctan(grid.half_size)) == pytest.approx(fov_deg)
+    assert np.degrees(2 * np.arctan(grid.resized((7, 8)).half_size)) == pytest.approx(fov_deg)
+
+
 def test_grids_are_compared_by_value() -> None:
     grid, cube = TangentGrid(0, 5), CubeGrid(32)
     different: list[PinholeGrid] = [
@@ -51,6 +73,7 @@ def test_grids_are_compared_by_value() -> None:
         TangentGrid(0, 5, 30),
     ]
     different += [cube, CubeGrid(33), CubeGrid(32, margin=1), RingGrid(RINGS, (100, 100), (8, 8))]
+    different += [RingGrid(RINGS, (100, 90), (8, 8), square_pixels=False)]
     different += [grid.with_rotation(ROTATION), cube.with_rotation(ROTATION)]
     different += [grid.resized((33, 33)), grid.subset([3, 4]), grid.subset([3, 5])]
     assert len(set(different)) == len({hash(grid) for grid in different}) == len(different)

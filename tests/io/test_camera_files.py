@@ -21,6 +21,7 @@ GRIDS: list[PinholeGrid] = [
     TangentGrid(0, 4),
     TangentGrid(1, 6, dim=25, rotation=ROTATION),
     RingGrid(RINGS, (80, 100), (30, 21), ROTATION),
+    RingGrid(RINGS, (80, 100), (30, 40), ROTATION, square_pixels=False),
 ]
 CAMERA = {"width": 21, "height": 30, "matrix": np.eye(3).tolist()}
 FACES = (0, 7, 11, 19)

@@ -98,21 +98,30 @@ def test_trains_resumes_evaluates_and_exports(
         assert np.abs(found - expected).sum() <= 0.002 * expected.sum()
 
 
-def test_the_zonal_classifier_trains_resumes_and_evaluates(tmp_path: Path) -> None:
-    pytest.importorskip("torch_harmonics")
-    settings = (
-        *("experiment=shapes/default", "network=zonal_classifier", "network.widths=[4,8]"),
-        *("data.shapes.train=3", "data.shapes.test=2", "data.val_fraction=0", "level=4"),
-        *("trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"),
+OF_SHAPES = {
+    "torch_harmonics": ("network=zonal_classifier", "network.widths=[4,8]"),
+    "e3nn": ("network=spherical_cnn", "network.widths=[4,8]", "network.bandwidths=[6,4]"),
+}
+"""Networks for shapes under rotation, by the package that they need."""
+
+
+@pytest.mark.parametrize("package", OF_SHAPES)
+def test_networks_of_shapes_train_resume_and_evaluate(package: str, tmp_path: Path) -> None:
+    pytest.importorskip(package)
+    data = (
+        *("experiment=shapes/default", "data.shapes.train=3", "data.shapes.test=2"),
+        *("data.val_fraction=0", "level=4"),
     )
+    run = "trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"
+    settings = (*data, *OF_SHAPES[package], *run)
     run_in(tmp_path, "train", *settings, "representation=erp")
     run_in(tmp_path, "train", "resume=run", "trainer.max_epochs=2")
     last = tmp_path / "run/checkpoints/last.ckpt"
-    evaluation = (*settings[:1], *settings[3:7], "hydra.run.dir=evaluated")
-    run_in(tmp_path, "evaluate", f"checkpoint={last}", *evaluation)
+    run_in(tmp_path, "evaluate", f"checkpoint={last}", *data, "hydra.run.dir=evaluated")
     assert results(tmp_path / "evaluated")["confusion"] == results(tmp_path / "run")["confusion"]
+    wrong = "representation=tangent", "hydra.run.dir=refused"
     with pytest.raises(SystemExit, match=r"found 16 × 16 .*representation=erp"):
-        run_in(tmp_path, "train", *settings, "hydra.run.dir=refused")
+        run_in(tmp_path, "train", *settings, *wrong)
 
 
 def test_the_reference_page_lists_every_network_with_its_number_of_parameters() -> None:

@@ -23,7 +23,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.geometry.camera import half_width
 from tangent_train.geometry.coverage import best_views, check_coverage, needed_views
-from tangent_train.geometry.sphere import area_mask, check_area
+from tangent_train.geometry.sphere import area_mask, check_area, lonlat_to_xyz
 from tangent_train.kinds import MOST_ROTATIONS
 from tangent_train.rendering.forward import Blend, blend_of
 from tangent_train.rendering.representations.views import STRIDE, PinholeViews, RotationAugmentation
@@ -240,10 +240,12 @@ class HorizontalRepresentation(PinholeRepresentation):
         level: Level s, which sets the angular resolution of the views.
         rings: Rings of views: ``pitch`` (latitude of the centers in degrees), number of ``views``
             around the vertical, and optionally their own ``fov``. Views of all rings have the same
-            number of pixels.
+            number of pixels. None for `covering_rings`.
         fov: Horizontal and vertical field of view in degrees, or one number for both.
         dim: Rows and columns in pixels, or only the columns; see `ring_size` for the default.
-            Pixels are square: rows and columns of another ratio than `fov` show more than it.
+        square_pixels: True for square pixels: rows and columns of another ratio than `fov` show
+            more than it. False to stretch exactly `fov` to them, like photos that were squashed.
+        overlap: Overlap of neighbors in `covering_rings`.
         faces_per_panorama: Number of random views in a training sample; all by default. A sample
             has views of one field of view, drawn in proportion to their number.
         random_rotation: Rotation of the views as a whole in training.
@@ -265,7 +267,7 @@ class HorizontalRepresentation(PinholeRepresentation):
     def __init__(
         self,
         level: int,
-        rings: Sequence[Mapping[str, float | Sequence[float]]],
+        rings: Sequence[Mapping[str, float | Sequence[float]]] | None,
         fov: float | Sequence[float],
         dim: int | Sequence[int] | None = None,
         faces_per_panorama: int | None = None,
@@ -275,7 +277,11 @@ class HorizontalRepresentation(PinholeRepresentation):
         erp_height: int | None = None,
         rotations: int = 1,
         area: Sequence[float] | None = None,
+        square_pixels: bool = True,
+        overlap: float = 0.25,
     ) -> None:
+        if rings is None:
+            rings = covering_rings(_pair(fov), overlap)
         by_fov: dict[tuple[float, float], list[dict[str, Any]]] = {}
         for ring in rings:
             others = {name: value for name, value in ring.items() if name != "fov"}
@@ -295,8 +301,9 @@ class HorizontalRepresentation(PinholeRepresentation):
         if area is not None:
             covered = area_mask(check_area(area, "representation.area"), (_ROWS, 2 * _ROWS))
         is_complete = self.must_cover and not is_joint
-        coverage = {"by_owners": blend == "nearest", "is_complete": is_complete}
-        grids = [RingGrid(part, of, size, None, covered, **coverage) for of, part in by_fov.items()]
+        kinds = {"by_owners": blend == "nearest", "is_complete": is_complete}
+        kinds["square_pixels"] = square_pixels
+        grids = [RingGrid(part, of, size, None, covered, **kinds) for of, part in by_fov.items()]
         if is_joint and self.must_cover:
             check_coverage(grids, covered)
         self.symmetry_deg = 360 / max(ring["views"] for part in by_fov.values() for ring in part)
@@ -397,6 +404,35 @@ def _rotated(grid: _Grid, rotation: NDArray[np.float64]) -> _Grid:
     """Rotate a grid in its own axes: with its rotation R, directions become R·rotation·d."""
     outer = np.eye(3) if grid.rotation is None else grid.rotation
     return grid.with_rotation(unless_identity(outer @ rotation))
+
+
+def covering_rings(fov_deg: tuple[float, float], overlap: float) -> list[dict[str, float]]:
+    """Return rings of views of one field of view that cover the sphere.
+
+    Args:
+        fov_deg: Horizontal and vertical field of view in degrees.
+        overlap: Least overlap of neighbors as a share of a view, from 0 to less than 1.
+
+    >>> covering_rings((62, 48), 0.1)[:2]
+    [{'pitch': 0.0, 'views': 7}, {'pitch': 43.2, 'views': 6}]
+    """
+    step = fov_deg[1] * (1 - overlap)
+    rings: list[dict[str, float]] = []
+    for number in range(1 + math.ceil((90 - fov_deg[1] / 2) / step)):
+        pitch = min(number * step, 90.0)
+        # The longitudes that a view at longitude 0 sees in the middle of its ring and at its lower
+        # edge, where they are fewest.
+        latitudes = (pitch + np.linspace(-0.5, 0.5, 9) * step).clip(max=90)
+        angles = np.meshgrid(np.arange(0, 180, 0.5), latitudes)
+        kinds: Any = {"square_pixels": False, "is_complete": False}
+        view = RingGrid([{"pitch": pitch, "views": 1}], fov_deg, (2, 2), **kinds)
+        seen = view.insets(lonlat_to_xyz(np.radians(np.stack(angles, -1)).reshape(-1, 2)))
+        half = 0.5 * (seen.reshape(9, -1) >= 0).sum(axis=1).min()
+        rings += [
+            {"pitch": sign * pitch, "views": max(1, math.ceil(180 / (half * (1 - overlap))))}
+            for sign in ((1, -1) if number else (1,))
+        ]
+    return rings
 
 
 def _pair(fov: float | Sequence[float]) -> tuple[float, float]:

@@ -200,7 +200,7 @@ class PinholeViews(Views):
 
     def reduced(self, image: Pixels) -> Pixels:
         """See `Views`."""
-        return reduce_to_pitch(image, self.grid.pitch)
+        return reduce_to_pitch(image, min(self.grid.pitches))
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """See `Views`."""

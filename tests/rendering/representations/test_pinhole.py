@@ -66,6 +66,7 @@ REPRESENTATIONS: list[Representation] = [
     HorizontalRepresentation(5, RINGS, 100),
     HorizontalRepresentation(5, RINGS, (110, 100), 40, blend="nearest", mirror=True),
     HorizontalRepresentation(5, WIDE_RINGS, 100),
+    HorizontalRepresentation(5, None, (62, 48), (30, 30), square_pixels=False),
     TangentRepresentation(0, 5),
     TangentRepresentation(1, 5, blend="feather"),
     TangentRepresentation(0, 5, crop_multiple=8, random_rotation="so3", mirror=True),
@@ -90,6 +91,21 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
     assert {images.shape[1:] for images in rendered} == {representation.image_size}
     back = _labels_of(source, [_scores(images) for images in rendered])
     assert np.mean(back == labels) > 0.95, "all but the borders between classes"
+
+
+@pytest.mark.parametrize("fov", [(62, 48), (100, 60), (40, 70), (120, 120)])
+@pytest.mark.parametrize("overlap", [0.1, 0.3])
+def test_rings_of_any_field_of_view_cover_the_sphere(
+    fov: tuple[float, float], overlap: float
+) -> None:
+    # Views that leave a gap, or meet only at their edges, are refused or do not overlap.
+    grid = HorizontalRepresentation(
+        5, None, fov, (24, 24), square_pixels=False, overlap=overlap
+    ).grid
+    assert grid.is_overlapping
+    assert np.degrees(2 * np.arctan(grid.half_size)) == pytest.approx(fov)
+    ideal = 4 * math.pi / (4 * math.asin(np.prod(np.sin(np.radians(fov) / 2))))
+    assert grid.num_images < 3.5 * ideal / (1 - overlap) ** 2
 
 
 @pytest.mark.parametrize("build", [partial(TangentRepresentation, 0), EquirectRepresentation])
@@ -214,7 +230,12 @@ def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> N
 
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize(
-    "grid", [TangentGrid(1, 5, 20, TILT), RingGrid(RINGS, (110, 100), (20, 33), TILT)]
+    "grid",
+    [
+        TangentGrid(1, 5, 20, TILT),
+        RingGrid(RINGS, (110, 100), (20, 33), TILT),
+        RingGrid(RINGS, (110, 100), (20, 33), TILT, square_pixels=False),
+    ],
 )
 def test_rays_are_the_directions_of_the_pixels(grid: PinholeGrid, mirrored: bool) -> None:
     faces = np.array([3, 17, 12])
