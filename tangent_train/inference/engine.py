@@ -26,7 +26,6 @@ from tangent_train.checkpoints.outputs import (
     OutputNetwork,
     named_outputs,
     network_for_views,
-    takes_cameras,
 )
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid
@@ -66,7 +65,8 @@ _LEAST = 1e-4
 def sees_rays(network: nn.Module) -> bool:
     """Return True if a network takes viewing rays or cameras, e.g. for cross-image attention."""
     inner: Any = network.network if isinstance(network, OutputNetwork) else network
-    return takes_cameras(network) or "rays" in inspect.signature(inner.forward).parameters
+    takes_cameras = bool(getattr(network, "takes_cameras", False))
+    return takes_cameras or "rays" in inspect.signature(inner.forward).parameters
 
 
 def views_per_forward(image_size: tuple[int, int]) -> int:
@@ -87,7 +87,7 @@ def scored_views(
             ``network(images, rays[None])``.
         sets: Sets of views.
         per_forward: Number of views per call of the network.
-        joins: True to call the network once for all sets, see `takes_cameras`.
+        joins: True to call the network once for all sets, see `OutputNetwork`.
 
     Yields:
         Views; their float32 scores ``(n, K, h, w)``, with the confidence as the last channel; and
@@ -316,7 +316,7 @@ class Predictor:
         if self._sees_rays:
             network = partial(network, view_batch_size=per_forward)
         count = sum(len(views) for views, _, _ in sets)
-        joins = takes_cameras(self._loaded.network)
+        joins = getattr(self._loaded.network, "takes_all_views", False)
         for views, scores, outputs in scored_views(network, sets, per_forward, joins):
             mosaic.add(scores, views)
             if "segments" in outputs and hasattr(mosaic, "add_segments"):

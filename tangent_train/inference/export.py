@@ -19,7 +19,7 @@ from tangent_train.checkpoints.loaded import (
     load_network,
     write_onnx_description,
 )
-from tangent_train.checkpoints.outputs import example_inputs, plain_output, takes_cameras
+from tangent_train.checkpoints.outputs import example_inputs, plain_output
 from tangent_train.errors import SettingError, check_choice, first_line, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.imports import hide_output
@@ -86,7 +86,7 @@ def export_network(
         failure = "an exported network contains only the computation"
     elif is_onnx and is_aware:
         failure = "distortion-aware convolutions would be right for one size only"
-    elif is_onnx and takes_cameras(loaded.network):
+    elif is_onnx and getattr(loaded.network, "takes_cameras", False):
         failure = "an ONNX file takes images without their cameras"
     for size in sizes if failure is None else ():
         try:
@@ -124,7 +124,7 @@ def _write_onnx(
     returns_labels = loaded.score_kind == "labels"
     with hide_output():
         program: Any = torch.onnx.export(
-            loaded.module if returns_labels else loaded.network,
+            loaded.module if returns_labels else replace(loaded, photo_fov_deg=None).network,
             (_random_images(loaded, 2, size),),
             dynamo=True,
             input_names=["images"],

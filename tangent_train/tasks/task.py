@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
 from datamodules.core.dataset import Sample, valid_mask
-from tangent_train.checkpoints.outputs import network_for_views, takes_cameras
+from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.errors import SettingError
 from tangent_train.heads import Head
 from tangent_train.inference.engine import scored_views, sees_rays, upright_rays
@@ -395,7 +395,7 @@ class PixelTask(Task):
 
     def _evaluated_views(self, sets: Iterable[Any]) -> Iterator[tuple[Any, Tensor, Any]]:
         """Yield views, their scores (see `scored_views`), and all outputs, for `loss_sum`."""
-        how = self.eval_view_batch_size, takes_cameras(self.network)
+        how = self.eval_view_batch_size, getattr(self.network, "takes_all_views", False)
         for views, scores, outputs in scored_views(self, sets, *how):
             yield views, scores, {**outputs, "out": scores}
 
