@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, suppress
 from functools import partial
 from typing import Any
@@ -76,7 +76,8 @@ def predict(settings: PredictSettings) -> None:
         shown = [n for n in names if n in manifest.finished]
         shown = [shown[k] for k in evenly_spread(settings.report, len(shown))]
         if shown:
-            folder.write_page(entries, list(prediction.pictures(inputs, shown)))
+            finished = {name: manifest.finished[name] for name in shown}
+            folder.write_page(entries, list(prediction.pictures(inputs, finished)))
         folder.table(entries).print()
         if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
             count = counted(len(spoiled), "images")
@@ -216,18 +217,19 @@ class _Prediction:
             entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
-        return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
+        return entry | self._head.entry(predicted, is_counted)
 
-    def pictures(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:
+    def pictures(self, inputs: Inputs, entries: Mapping[str, Any]) -> Iterator[Any]:
         """Yield compressed images for the report, if the predicted pixels were written.
 
         The least confident are first. Only images that this call has predicted have a confidence.
         """
         means = {name: found.mean() for name, found in self._confidences.items()}
-        for job in sorted(inputs.jobs(names), key=lambda job: means.get(job.name, 1)):
+        for job in sorted(inputs.jobs(entries), key=lambda job: means.get(job.name, 1)):
             file = self.folder.files(job).get(self._head.source)
             if file is not None:
-                predicted = PredictedImage(self.read(job), self._head.read(file))
+                facts = entries[job.name]
+                predicted = PredictedImage(self.read(job), self._head.read(file), facts)
                 confidence = self._confidences.get(job.name)
                 yield encode_prediction(self._head, job.name, predicted, confidence)
 
