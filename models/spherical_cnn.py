@@ -53,13 +53,14 @@ class RingCorrelation(nn.Module):
         weight = torch.empty(in_channels, len(rings_deg), out_channels, points)
         scale = 1 / math.sqrt(in_channels * len(rings_deg) * points)
         self.weight = nn.Parameter(nn.init.normal_(weight, std=scale))
-        # Frequencies 0 … b − 1, −b … −1; the first of them only, if f does not depend on γ.
+        # Frequencies 0 … b − 1, −b … −1.
+        orders = torch.cat([torch.arange(bandwidth), torch.arange(-bandwidth, 0)])
         self.orders: Tensor
-        self.register_buffer("orders", _orders(bandwidth), persistent=False)
+        self.register_buffer("orders", orders, persistent=False)
         self._rows = result_rows
-        self._n = self.orders.tolist() if turns > 1 else [0]
-        kept = slice(None if turns > 1 else 1)
-        analysis = _wigner(bandwidth, pixel_colatitudes(rows))[..., :bandwidth, kept]
+        # A panorama does not depend on γ: its order n is 0.
+        self._n = slice(None if turns > 1 else 1)
+        analysis = _wigner(bandwidth, pixel_colatitudes(rows))[..., :bandwidth, self._n]
         analysis = analysis * pixel_row_weights(rows)[:, None, None] / 2
         tilt = _wigner(bandwidth, torch.deg2rad(torch.tensor(rings_deg, dtype=torch.float64)))
         synthesis = _wigner(bandwidth, pixel_colatitudes(result_rows))[..., :bandwidth, :]
@@ -68,7 +69,7 @@ class RingCorrelation(nn.Module):
         self.tilt: Tensor
         self.synthesis: Tensor
         self.register_buffer("analysis", analysis.float(), persistent=False)
-        self.register_buffer("tilt", tilt[..., kept].float(), persistent=False)
+        self.register_buffer("tilt", tilt[..., self._n].float(), persistent=False)
         self.register_buffer("synthesis", (gain * synthesis).float(), persistent=False)
 
     def forward(
@@ -78,7 +79,7 @@ class RingCorrelation(nn.Module):
         with torch.autocast(values.device.type, enabled=False):
             bandwidth = self.analysis.shape[0]
             waves = torch.fft.rfft(values.float(), norm="forward")[..., :bandwidth]
-            waves = torch.fft.fft(waves, dim=-2, norm="forward")[..., self._n, :]
+            waves = torch.fft.fft(waves, dim=-2, norm="forward")[..., self.orders[self._n], :]
             spectrum = torch.view_as_real(waves)
             spectrum = torch.einsum("xcjnmz,ljmn->xclmnz", spectrum, self.analysis)
             spectrum = torch.einsum("xclmnz,lran->xcrlmaz", spectrum, self.tilt)
@@ -111,10 +112,10 @@ class SphericalCNN(nn.Module):
         num_classes: Number of classes.
         level: Level s of the image.
         widths: Channels after each correlation.
-        bandwidths: Bandwidth after each correlation; at most half of the rows of the image.
+        bandwidths: Bandwidth after each correlation, limited to the one before, at first to 2^s.
         rings_deg: Angle of each ring of the filters from the pole, in degrees.
-        oversampling: Angles of the grid per 2b of the bandwidth. ReLU leaves the bandwidth, so with
-            1, as published, scores change slightly under rotation; with 2, about five times less.
+        oversampling: Angles of a grid, divided by 2b. ReLU exceeds the bandwidth b, so that with 1,
+            as published, scores change slightly under rotation; with 2, about five times less.
 
     Raises:
         SettingError: e3nn is missing.
@@ -160,17 +161,12 @@ class SphericalCNN(nn.Module):
         return scores
 
 
-def _orders(bandwidth: int) -> Tensor:
-    """Return the frequencies of a Fourier transform of 2b values: 0 … b − 1, −b … −1."""
-    return torch.cat([torch.arange(bandwidth), torch.arange(-bandwidth, 0)])
-
-
 def _wigner(bandwidth: int, angles: Tensor) -> Tensor:
-    """Return d^l_mn(β), zero for orders beyond ±l; float64 ``(l, β, m, n)``, see `_orders`."""
+    """Return d^l_mn(β), float64 ``(l, β, m, n)``, with order −m at index 2b − m, else zeros."""
     with of_extra("spectral", "network=spherical_cnn"):
         from e3nn import o3
-    orders = 2 * bandwidth
-    matrices = torch.zeros(bandwidth, len(angles), orders, orders, dtype=torch.float64)
+    shape = bandwidth, len(angles), 2 * bandwidth, 2 * bandwidth
+    matrices = torch.zeros(shape, dtype=torch.float64)
     for degree, matrix in enumerate(matrices):
         basis = o3.change_basis_real_to_complex(degree, torch.float64)
         m = torch.arange(-degree, degree + 1)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.distortion_aware import make_distortion_aware
+from models.segments import Segments
 from tangent_train.checkpoints.cameras import cameras_of_rays, rotation_error_deg
 from tangent_train.errors import SettingError
 from tangent_train.kinds import ScoreKind
@@ -39,10 +40,11 @@ class OutputNetwork(nn.Module):
     Args:
         network: Network that maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to label maps
             or depth, with or without an axis of channels, or to a dict with one of these under
-            ``"out"`` (as in torchvision). If its `forward` also takes ``world_from_camera`` and
-            ``camera_matrix`` ``(V, 3, 3)``, see `cameras_of_rays`, the images are all V views of a
-            panorama. A dict of a depth network may also contain ``"confidence"`` ``(B, h, w)`` and
-            its own ``"world_from_camera"``.
+            ``"out"`` (as in torchvision). If its `forward` also takes ``camera_matrix``
+            ``(B, 3, 3)``, it gets the matrix K of each view, see `cameras_of_rays`. If it takes
+            ``world_from_camera`` and ``camera_matrix`` ``(V, 3, 3)``, the images are all V views of
+            a panorama. A dict of a depth network may also contain ``"confidence"``
+            ``(B, h, w)`` and its own ``"world_from_camera"``.
         num_outputs: Number of channels of its output: K classes, or `depth_channels`.
         groups: Indices of the network's scores for each class, including index K of kinds that
             have it. Scores in no group, and classes without scores, never win. None if each score
@@ -51,11 +53,13 @@ class OutputNetwork(nn.Module):
             sizes. Larger images are divided for classes. For depth, images are resized: the parts
             of an image would have different scales.
         kind: Kind of the scores; None for depth.
+        gain: Number by which depth is multiplied: for z-depth in meters of one camera, the width of
+            its image at distance 1 makes it `canonical_z`.
 
     Attributes:
         num_outputs: Number of channels of the converted output, with `groups` their number.
         tile: See above.
-        takes_cameras: True if the network takes all views of a panorama with their cameras.
+        takes_cameras: True if the network takes views of a panorama with their cameras.
     """
 
     def __init__(
@@ -65,19 +69,24 @@ class OutputNetwork(nn.Module):
         groups: Groups | None = None,
         tile: tuple[int, int] | None = None,
         kind: ScoreKind | None = "logits",
+        gain: float = 1.0,
     ) -> None:
         super().__init__()
         self.network = network
         self.num_outputs = num_outputs if groups is None else len(groups)
         self.tile = tile
-        self._groups, self._kind = groups, kind
-        self.takes_cameras = "world_from_camera" in signature(network.forward).parameters
+        self._groups, self._kind, self._gain = groups, kind, gain
+        named = signature(network.forward).parameters
+        self.takes_cameras = "camera_matrix" in named
+        self._takes_all_views = "world_from_camera" in named
 
     def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Any:
         """Return the converted output ``(B, num_outputs, h, w)``.
 
         A depth network that returns a confidence or rotations yields a dict: the output under
-        ``"out"``, ``"confidence"`` ``(B, 1, h, w)`` and ``"rotation_error_deg"``.
+        ``"out"``, ``"confidence"`` ``(B, 1, h, w)`` and ``"rotation_error_deg"``. So does a network
+        of classes that returns objects: ``"segments"``, a list of `Segments`, whose classes become
+        those of the output. Tiles have no objects.
 
         Args:
             images: Normalized images ``(B, C, h, w)``.
@@ -102,10 +111,17 @@ class OutputNetwork(nn.Module):
             if not arguments:
                 expected = "a panorama in tangent images, horizontal views or a cube map"
                 raise SettingError("views", found="views without cameras", expected=expected)
+            batch = settings.get("view_batch_size")
             arguments, settings = cameras_of_rays(arguments[0][0], tile), {}
         images = images if tile == size else _resized(images, tile)
-        returned = named_outputs(self.network(images, *arguments, **settings))
+        if self.takes_cameras and not self._takes_all_views:
+            given = (torch.split(each, batch or len(images)) for each in (images, arguments[1]))
+            parts = [named_outputs(self.network(*part)) for part in zip(*given, strict=True)]
+            returned = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        else:
+            returned = dict(named_outputs(self.network(images, *arguments, **settings)))
         outputs = {n: _with_channels(returned[n]) for n in _MAPS if n in returned}
+        outputs["out"] = outputs["out"] * self._gain
         if tile != size:
             outputs = {name: _resized(values, size) for name, values in outputs.items()}
         if self.takes_cameras and "world_from_camera" in returned:
@@ -113,14 +129,26 @@ class OutputNetwork(nn.Module):
             outputs["rotation_error_deg"] = error
         return outputs if len(outputs) > 1 else outputs["out"]
 
-    def _scores(self, kind: ScoreKind, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
-        outputs = plain_output(self.network(images, *arguments, **settings))
-        groups = self._groups
+    def _scores(self, kind: ScoreKind, images: Tensor, *arguments: Any, **settings: Any) -> Any:
+        returned = named_outputs(self.network(images, *arguments, **settings))
+        outputs, groups = returned["out"], self._groups
         last = self.num_outputs - 1 if groups is None else max(k for group in groups for k in group)
         scores = as_logits(outputs, kind, last)
-        if groups is None:
+        if groups is not None:
+            scores = torch.cat([_sum(scores, group) for group in groups], dim=1)
+        if "segments" not in returned:
             return scores
-        return torch.cat([_sum(scores, group) for group in groups], dim=1)
+        segments = [_regrouped(each, groups) for each in returned["segments"]]
+        return {"out": scores, "segments": segments}
+
+
+def _regrouped(segments: Segments, groups: Groups | None) -> Segments:
+    """Return objects with the number of the group of their class; −1 for none."""
+    if groups is None:
+        return segments
+    group_of = {k: number for number, group in enumerate(groups) for k in group}
+    found = [group_of.get(k, -1) for k in segments.classes.tolist()]
+    return segments._replace(classes=torch.tensor(found).to(segments.classes))
 
 
 def network_for_views(network: nn.Module, distortion_aware: bool | None) -> nn.Module:
@@ -209,7 +237,7 @@ def _resized(images: Tensor, size: Any) -> Tensor:
 
 
 def _mean_of_tiles(
-    network: Callable[[Tensor], Tensor], images: Tensor, tile: tuple[int, int]
+    network: Callable[[Tensor], Any], images: Tensor, tile: tuple[int, int]
 ) -> Tensor:
     """Return the mean scores of evenly spaced tiles that cover larger images."""
     tops, lefts = (
@@ -219,7 +247,7 @@ def _mean_of_tiles(
     total, count = torch.zeros(()), images.new_zeros((len(images), 1, *images.shape[-2:]))
     for top, left in itertools.product(tops, lefts):
         area = (..., slice(top, top + tile[0]), slice(left, left + tile[1]))
-        scores = network(images[area])
+        scores = plain_output(network(images[area]))
         if not total.ndim:
             total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
         total[area] += scores

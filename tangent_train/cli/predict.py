@@ -36,6 +36,9 @@ from tangent_train.manifest import Manifest, Shard
 from tangent_train.rendering.resampling import resize
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
 
+_MOST_LOG_SCALE = 3.0
+"""Logarithm of a scale above which nothing determines it: without parallax, all large ones fit."""
+
 _COUNTED_IMAGES = 32
 """Images whose confidences are counted for `min_share`, at most."""
 
@@ -88,7 +91,8 @@ def predict(settings: PredictSettings) -> None:
         folder.write_summary(content, entries)
         shown = [[*finished][k] for k in evenly_spread(settings.report, len(finished))]
         if shown:
-            folder.write_page(entries, list(prediction.pictures(inputs, shown)))
+            finished = {name: manifest.finished[name] for name in shown}
+            folder.write_page(entries, list(prediction.pictures(inputs, finished)))
         folder.table(entries).print()
         if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
             count = counted(len(spoiled), "images")
@@ -233,7 +237,7 @@ class _Prediction:
             entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
-        return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
+        return entry | self._head.entry(predicted, is_counted)
 
     def _unscaled(self, name: str) -> Path:
         return self.folder.path / "unscaled" / f"{name}.npy"
@@ -262,6 +266,8 @@ class _Prediction:
             of_group = [poses[name] for name in group if name in poses]
             fit = partial(pose_scales, poses=of_group) if of_group else frame_scales
             found, steps = fit(np.stack(maps))
+            if np.abs(np.log(found)).max() > _MOST_LOG_SCALE:
+                continue
             self._scales |= zip(group, found.tolist(), strict=True)
             text = "{:.1%} before, {:.1%} after".format(*steps)
             print_text(f"One scale for {len(group)} images: median step between them {text}.")
@@ -277,16 +283,17 @@ class _Prediction:
         kept = {name: value for name, value in facts.items() if name not in changed}
         return job.value, (pixels, {**kept, "scale": scale})
 
-    def pictures(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:
+    def pictures(self, inputs: Inputs, entries: Mapping[str, Any]) -> Iterator[Any]:
         """Yield compressed images for the report, if the predicted pixels were written.
 
         The least confident are first. Only images that this call has predicted have a confidence.
         """
         means = {name: found.mean() for name, found in self._confidences.items()}
-        for job in sorted(inputs.jobs(names), key=lambda job: means.get(job.name, 1)):
+        for job in sorted(inputs.jobs(entries), key=lambda job: means.get(job.name, 1)):
             file = self.folder.files(job).get(self._head.source)
             if file is not None:
-                predicted = PredictedImage(self.read(job), self._head.read(file))
+                facts = entries[job.name]
+                predicted = PredictedImage(self.read(job), self._head.read(file), facts)
                 confidence = self._confidences.get(job.name)
                 yield encode_prediction(self._head, job.name, predicted, confidence)
 

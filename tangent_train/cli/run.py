@@ -199,8 +199,8 @@ class Run:
         notes, tables = [f"{source}: {name}", *self.notes], evaluation.result_tables(result)
         summary, (rows, sources) = evaluation.summary_lines(result), published_rows([result])
         published = [published_table(rows, result)] if rows else []
-        evaluation.write_results(result, self.folder, [*notes, *sources], published)
         evaluation.write_image_sums(self.folder, [files.name for files in items], sums)
+        evaluation.write_results(result, self.folder, [*notes, *sources], published)
         network = source if task.network is None else type(self.as_loaded().module).__name__
         images = [i for c in callbacks if isinstance(c, Pictures) for i in c.images]
         shown = [f"Shown: {len(images)} of {result.images} {data.noun}, the worst first."]

@@ -129,9 +129,9 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 
     # --- views ---
     views: Views = None
-    """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy | erp |
-    erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null = those of
-    the checkpoint"""
+    """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy |
+    horizontal_camera | erp | erp_distortion_aware | cubemap, or 'views={option: horizontal, fov:
+    110}'; null = those of the checkpoint"""
     levels: OneOrMore[Level] | None = None
     """level s, or several levels of tangent images to average over; null = as in the checkpoint"""
     base_level: int | None = None
@@ -319,9 +319,9 @@ class ImportSettings(Settings):
     scores: ScoreKind | None = None
     """output of the network: logits | probabilities | labels; null = recognized from its values"""
     depth: DepthKind | None = None
-    """kind of depth that the network predicts: metric_z | metric_distance | relative_z |
-    relative_depth | relative_disparity | relative_points | canonical_inverse | log_distance; null =
-    from the model (huggingface), else it predicts classes"""
+    """kind of depth that the network predicts: metric_z | metric_distance | canonical_z |
+    canonical_inverse | relative_z | relative_depth | relative_disparity | relative_points |
+    log_distance; null = from the model (huggingface), else it predicts classes"""
     image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
     """fixed image size: [rows,columns] or the side; null = from the model"""
 
@@ -337,13 +337,14 @@ class ImportSettings(Settings):
     # --- photos and views ---
     normalization: str | dict[str, tuple[float, ...]] | None = None
     """imagenet | unit | symmetric | {mean: […], std: […]}; null = from the model"""
-    fov: FieldOfView = 60
-    """horizontal field of view in degrees of the photos it was trained on, for predictions on
+    fov: FieldOfView | tuple[FieldOfView, FieldOfView] | None = None
+    """field of view in degrees of the photos it was trained on, or [horizontal, vertical]; with it,
+    the depth of metric_z networks follows the focal length of a view; null = 60 for predictions on
     photos"""
     views: Views = None
-    """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |
-    erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null =
-    horizontal_wide; with levels= or base_level=, tangent"""
+    """views of panoramas: horizontal_wide | horizontal | horizontal_economy | horizontal_camera |
+    tangent | erp | erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null
+    = horizontal_wide; with levels= or base_level=, tangent"""
     levels: OneOrMore[Level] | None = None
     """level s, or several levels of tangent images; null = from the image size, two for tangent
     images, e.g. [9, 8]"""

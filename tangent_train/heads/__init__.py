@@ -10,12 +10,14 @@ from tangent_train.errors import wrong_setting
 from tangent_train.heads.base import Head, PredictedImage, Scores
 from tangent_train.heads.classes import ClassesHead, ImageClassHead
 from tangent_train.heads.distance import DistanceHead
+from tangent_train.heads.panoptic import PanopticHead
 
 __all__ = [
     "ClassesHead",
     "DistanceHead",
     "Head",
     "ImageClassHead",
+    "PanopticHead",
     "PredictedImage",
     "Scores",
     "head_of",
@@ -35,7 +37,10 @@ def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:
     try:
         if loaded.depth_kind is not None:
             return DistanceHead(depth_kind=loaded.depth_kind, **settings)
-        head = ClassesHead(loaded.class_names, **settings)
+        if loaded.things:
+            head: ClassesHead = PanopticHead(loaded.class_names, loaded.things, **settings)
+        else:
+            head = ClassesHead(loaded.class_names, **settings)
     except ValidationError as error:
         raise wrong_setting(error) from error
     head.num_outputs = loaded.network.num_outputs  # with that of no class

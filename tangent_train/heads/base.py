@@ -109,8 +109,8 @@ class Head(nn.Module, ABC):
             the kind of output or the other setting that it needs; "" for none.
         is_metric: False for distances that are known up to a scale.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind (`source`)
-            holds the predicted pixels, from which pictures are drawn. By default, it and the
-            pictures are written.
+            holds the predicted pixels, from which pictures are drawn.
+        usual_kinds: Kinds that are written by default, besides the first.
         summary: Name of the summary of an image in the summary file.
         summary_columns: Names in the summary of an image that ``summary.csv`` lists.
         unknown: Value of unknown pixels.
@@ -125,6 +125,7 @@ class Head(nn.Module, ABC):
     predict_settings: ClassVar[Mapping[str, str]] = NOTHING
     summary: ClassVar[str] = ""
     unknown: ClassVar[float] = 0
+    usual_kinds: ClassVar[Sequence[str]] = PICTURES
     waits: ClassVar[bool] = False
     num_outputs: int
     is_metric: bool = True
@@ -221,7 +222,8 @@ class Head(nn.Module, ABC):
         Returns:
             An object with ``add(outputs, views)``, which adds the outputs ``(n, C, h, w)`` of some
             views, ``pixels()``, which returns the prediction ``(H, W)``, and ``facts`` about it.
-            ``not_finite`` is the share of the pixels whose outputs are NaN or infinite.
+            ``not_finite`` is the share of the pixels whose outputs are NaN or infinite. If it has
+            ``add_segments(segments, views)``, that adds the objects of some views, see `Segments`.
         """
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Any:
@@ -263,7 +265,7 @@ class Head(nn.Module, ABC):
         if foreign := set(write or ()).difference(self.suffixes):
             expected = f"{', '.join(self.suffixes)} for a network that predicts {self.source}"
             raise SettingError("write", found=", ".join(sorted(foreign)), expected=expected)
-        usual = [kind for kind in self.suffixes if kind in (self.source, *PICTURES)]
+        usual = [kind for kind in self.suffixes if kind in (self.source, *self.usual_kinds)]
         return usual if write is None else write
 
     @property
@@ -311,6 +313,10 @@ class Head(nn.Module, ABC):
         """Return the picture of a single image with its legend, see `paint`."""
         return self.paint(kind, rgb, pixels)
 
+    def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
+        """Return the maps of one image in the report, by argument of `encode_image`."""
+        return {"prediction": predicted.pixels}
+
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return the summary of one image.
 
@@ -319,6 +325,18 @@ class Head(nn.Module, ABC):
             is_counted: Mask ``(h, w)``, or of any shape that fits, that is True for counted pixels.
         """
         return {}
+
+    def entry(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> dict[str, Any]:
+        """Return the part of the entry of one image in the summary file, see `summarize`."""
+        return {self.summary: self.summarize(predicted, is_counted)}
+
+    def write_tables(self, folder: Path, entries: Sequence[Mapping[str, Any]]) -> None:
+        """Write further tables of all images to the output folder.
+
+        Args:
+            folder: Output folder.
+            entries: Entries of all images in the summary file.
+        """
 
     def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], Sequence[Sequence[str]]]:
         """Return title, header and rows of a table of the summaries of all images."""

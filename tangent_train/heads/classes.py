@@ -184,12 +184,14 @@ class ClassesHead(Head):
     ) -> LabelMosaic:
         """Return a mosaic of probabilities, which reuses the memory of an earlier one."""
         spare = self._spare.pop() if self._spare else None
-        mosaic = LabelMosaic(
-            self, shape, blend, averaged=averaged or self.min_share > 0, spare=spare, **settings
-        )
+        averaged = averaged or self.min_share > 0
+        mosaic = self._new_mosaic(shape, blend, averaged=averaged, spare=spare, **settings)
         if not isinstance(mosaic.sums, np.memmap):  # space on the disk is released at once
             weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
         return mosaic
+
+    def _new_mosaic(self, *given: Any, **settings: Any) -> LabelMosaic:
+        return LabelMosaic(self, *given, **settings)
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
         """Return the labels of the largest logits; 0 where a logit is NaN or infinite."""

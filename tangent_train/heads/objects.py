@@ -21,16 +21,21 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from models.segments import Segments
+from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    equirect_directions,
     equirect_solid_angles,
+    equirect_to_lonlat,
     lonlat_to_xyz,
+    ray_lengths,
     xyz_to_lonlat,
 )
+from tangent_train.geometry.sphere import Floats
 from tangent_train.rendering import kernels
-from tangent_train.rendering.representations.views import Views
+from tangent_train.rendering.representations.perspective import PhotoCrops
+from tangent_train.rendering.representations.views import PinholeViews, Views
 
 Numbers = NDArray[np.int32]
+Matrix = Floats | None
 
 LEAST_OVERLAP = 0.5
 """Intersection over union, at the directions that two views see, from which masks join."""
@@ -48,6 +53,9 @@ _LEAST_SR = 1e-5
 
 
 _BOX = "longitude_deg", "latitude_deg", "width_deg", "height_deg"
+OBJECT_COLUMNS = ("number", "class", "score", *_BOX, "solid_angle_sr")
+"""Names in the table of objects, see `described`."""
+
 _STEPS = 3
 """Steps in which the center of a spherical box moves from the mean direction to its middle."""
 
@@ -56,7 +64,7 @@ class Objects(NamedTuple):
     """Objects of a panorama or photo.
 
     Attributes:
-        numbers: ``(H, W)`` int32 number of the object at each pixel, from 1; 0 for none.
+        numbers: ``(H, W)`` int32 number of the object at each pixel, 0 for none; 1 is the largest.
         classes: ``(n,)`` index of the class of each object.
         scores: ``(n,)`` confidence of each object, 0 to 1: the mean of its masks by solid angle.
     """
@@ -69,6 +77,7 @@ class Objects(NamedTuple):
 def join_objects(
     sets: Sequence[tuple[Views, Sequence[Segments]]],
     shape: tuple[int, int],
+    camera_matrix: Matrix = None,
     least_overlap: float = LEAST_OVERLAP,
 ) -> Objects:
     """Put together the objects of a panorama or photo.
@@ -76,7 +85,11 @@ def join_objects(
     Args:
         sets: Sets of views, pinhole images or crops of one size, and the objects of each view.
         shape: ``(H, W)`` of the panorama or photo.
+        camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for a panorama.
         least_overlap: See `LEAST_OVERLAP`.
+
+    Raises:
+        SettingError: The views are not pinhole images.
     """
     segments = [of_view for _, of_views in sets for of_view in of_views]
     first = np.cumsum([0, *(len(of_view.scores) for of_view in segments)])
@@ -87,8 +100,9 @@ def join_objects(
     numbers = np.stack([of_view.numbers.cpu().numpy() for of_view in segments])
     numbers = np.where(numbers > 0, numbers + first[:-1, None, None], 0)
     rows = min(shape[0], _ROWS)
-    small = rows, round(rows * shape[1] / shape[0])
-    masks, seen = _incidence(numbers, _geometry(sets, small), small, len(classes))
+    small = shape if camera_matrix is not None else (rows, 2 * rows)
+    weights = _pixel_weights(small, camera_matrix).ravel()
+    masks, seen = _incidence(numbers, _geometry(sets, small), weights, len(classes))
     view = np.repeat(np.arange(len(segments)), np.diff(first))
     group = _groups(masks, seen, view, classes, least_overlap)
     area = masks.sum(axis=1)
@@ -102,12 +116,21 @@ def join_objects(
     kernels.over_rows(kernels.vote, *shape, table, _geometry(sets, shape), votes, winners)
     of_masks = np.ones(len(group)), (group, np.arange(len(group)))
     in_groups = sparse.csr_array(of_masks, (len(total), len(group)))
-    covered = (in_groups @ masks).astype(bool) @ _pixel_weights(small).ravel()
-    return _kept(Objects(winners, class_of, of_group), covered)
+    covered = (in_groups @ masks).astype(bool) @ weights
+    won = solid_angles(winners, len(total), camera_matrix)
+    kept = np.flatnonzero((won >= _LEAST_SR) & (won >= _LEAST_SHARE * covered))
+    kept = kept[np.argsort(-won[kept], kind="stable")]
+    table = np.zeros(len(won) + 1, np.int32)
+    table[kept + 1] = np.arange(1, len(kept) + 1)
+    return Objects(table[winners], class_of[kept], of_group[kept])
 
 
 def _geometry(sets: Sequence[tuple[Views, Any]], shape: tuple[int, int]) -> kernels.CanvasGeometry:
     """Return the geometry of all views of all sets."""
+    for views, _ in sets:
+        if not isinstance(views, PinholeViews | PhotoCrops):
+            expected = "pinhole images: horizontal views, tangent images or a cube map"
+            raise SettingError("views", found=type(views).__name__, expected=expected)
     parts = [views.geometry(shape, None) for views, _ in sets]
     images, matrices, spans = (
         np.concatenate([getattr(part, name) for part in parts])
@@ -117,38 +140,38 @@ def _geometry(sets: Sequence[tuple[Views, Any]], shape: tuple[int, int]) -> kern
 
 
 def _incidence(
-    numbers: NDArray[np.int64], geometry: kernels.CanvasGeometry, shape: tuple[int, int], count: int
+    numbers: NDArray[np.int64], geometry: kernels.CanvasGeometry, weights: Floats, count: int
 ) -> tuple[sparse.csr_array, sparse.csr_array]:
     """Return the solid angle of each pixel in each mask, and which pixels each view sees.
 
     Args:
         numbers: ``(n, h, w)`` numbers of the masks, from 1; 0 for none.
-        geometry: Geometry of the views and a canvas.
-        shape: ``(H, W)`` of the canvas.
+        geometry: Geometry of the views and a canvas ``(H, W)``.
+        weights: ``(H W,)`` solid angle of the pixels of the canvas.
         count: Number of masks.
 
     Returns:
         ``(masks, H W)`` steradians, and ``(n, H W)`` ones.
     """
+    canvas = len(geometry.rows), geometry.columns.shape[1]
     (height, width), found, pixels = numbers.shape[1:], list[Any](), list[Any]()
     for matrix, spans, of_view in zip(geometry.matrices, geometry.spans, numbers, strict=True):
         start, length = spans.T
-        row = np.repeat(np.arange(shape[0]), length)
+        row = np.repeat(np.arange(canvas[0]), length)
         before = np.repeat(np.cumsum(length) - length - start, length)
-        column = (np.arange(len(row)) - before) % shape[1]
+        column = (np.arange(len(row)) - before) % canvas[1]
         across, up = geometry.rows[row].T
         east, north = across * geometry.columns[:, column]
         u, v, w = matrix @ np.stack([east, north, up])
         x, y = np.floor(u / w + 0.5).astype(np.int64), np.floor(v / w + 0.5).astype(np.int64)
         inside = (w > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        pixels.append((row * shape[1] + column)[inside])
+        pixels.append((row * canvas[1] + column)[inside])
         found.append(of_view[y[inside], x[inside]])
     view = np.repeat(np.arange(len(pixels)), [len(of_view) for of_view in pixels])
     pixel, number = np.concatenate(pixels), np.concatenate(found)
-    seen = sparse.csr_array((np.ones(len(pixel)), (view, pixel)), (len(numbers), math.prod(shape)))
+    seen = sparse.csr_array((np.ones(len(pixel)), (view, pixel)), (len(numbers), len(weights)))
     pixel, number = pixel[number > 0], number[number > 0] - 1
-    weights = _pixel_weights(shape).ravel()[pixel]
-    return sparse.csr_array((weights, (number, pixel)), (count, math.prod(shape))), seen
+    return sparse.csr_array((weights[pixel], (number, pixel)), (count, len(weights))), seen
 
 
 def _groups(
@@ -184,75 +207,70 @@ def _groups(
     return found
 
 
-def _kept(objects: Objects, covered: NDArray[np.float64]) -> Objects:
-    """Leave out small objects, and those that others have covered.
-
-    Args:
-        objects: Objects.
-        covered: Solid angle of the union of the masks of each object.
-    """
-    count = len(objects.scores)
-    won = solid_angles(objects.numbers, count)
-    is_kept = (won >= _LEAST_SR) & (won >= _LEAST_SHARE * covered)
-    table = np.append(0, np.cumsum(is_kept) * is_kept).astype(np.int32)
-    return Objects(table[objects.numbers], objects.classes[is_kept], objects.scores[is_kept])
-
-
-def solid_angles(numbers: Numbers, count: int) -> NDArray[np.float64]:
-    """Return the solid angle ``(n,)`` of each object, or of a photo its share times 4π."""
-    weights = _pixel_weights(numbers.shape)
+def solid_angles(numbers: Numbers, count: int, camera_matrix: Matrix = None) -> Floats:
+    """Return the solid angle ``(n,)`` of each object, in steradians."""
+    weights = _pixel_weights(numbers.shape, camera_matrix)
     found: Any = np.bincount(numbers.ravel(), weights.ravel(), count + 1)
     return np.asarray(found[1:], np.float64)
 
 
-def _pixel_weights(shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the solid angle of the pixels of a panorama; of a photo, equal parts of 4π."""
-    height, width = shape
-    if width != 2 * height:
-        return np.full((height, width), 4 * math.pi / (height * width))
-    return np.broadcast_to(equirect_solid_angles((height, width))[:, None], (height, width))
+def _pixel_weights(shape: tuple[int, ...], camera_matrix: Matrix) -> Floats:
+    """Return the solid angle of the pixels ``(H, W)`` of a panorama, or of a photo with K."""
+    if camera_matrix is None:
+        return np.broadcast_to(equirect_solid_angles((shape[0], shape[1]))[:, None], shape)
+    focal = camera_matrix[0, 0] * camera_matrix[1, 1]
+    weights: Floats = ray_lengths(camera_matrix, shape) ** -3 / focal
+    return weights
 
 
 def described(
-    objects: Objects, class_names: Sequence[str], distance: NDArray[np.floating] | None = None
+    objects: Objects, class_names: Sequence[str], camera_matrix: Matrix = None
 ) -> list[dict[str, Any]]:
-    """Return a table of objects, the largest solid angle first.
+    """Return a table of objects in the order of their numbers.
 
     A spherical box has a center and a field of view: the object's ranges of longitude and latitude
     in a frame in which the center of the box is straight ahead.
 
     Args:
-        objects: Objects of a panorama.
+        objects: Objects of a panorama or photo.
         class_names: Names of the classes.
-        distance: ``(H, W)`` distances from the center, NaN where unknown.
+        camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
 
     Returns:
-        For each object its ``number`` in the map, ``class``, ``score``, ``longitude_deg``,
-        ``latitude_deg``, ``width_deg`` and ``height_deg`` of its box, ``solid_angle_sr``, and
-        ``distance``, the median by pixels.
+        For each object its ``number`` in the map, ``class``, ``score``; ``longitude_deg``,
+        ``latitude_deg``, ``width_deg`` and ``height_deg`` of its box, in a photo relative to the
+        optical axis; and ``solid_angle_sr``.
     """
-    shape = objects.numbers.shape
-    directions = equirect_directions((shape[0], shape[1])).reshape(-1, 3)
-    pixels = np.flatnonzero(objects.numbers)
-    pixels = pixels[np.argsort(objects.numbers.ravel()[pixels], kind="stable")]
-    angles = solid_angles(objects.numbers, len(objects.scores))
-    ends = np.cumsum(np.bincount(objects.numbers.ravel(), minlength=len(angles) + 1)[1:])
+    numbers, count = objects.numbers, len(objects.scores)
+    pixels = np.flatnonzero(numbers)
+    pixels = pixels[np.argsort(numbers.ravel()[pixels], kind="stable")]
+    ends = np.cumsum(np.bincount(numbers.ravel(), minlength=count + 1)[1:])
     entries = []
-    for k, part in enumerate(np.split(pixels, ends[:-1])[: len(angles)]):
-        center, extent = _box(directions[part])
-        extent = extent + math.pi / shape[0]  # between outer edges of pixels
-        entry = {
-            "number": k + 1,
-            "class": class_names[objects.classes[k]],
-            "score": round(float(objects.scores[k]), 4),
-            **dict(zip(_BOX, np.degrees([*center, *extent]).round(2).tolist(), strict=True)),
-            "solid_angle_sr": float(f"{angles[k]:.4g}"),
-        }
-        if distance is not None:
-            known = distance.ravel()[part]
-            entry["distance"] = round(float(np.nanmedian(known)), 3) if known.any() else None
-        entries.append(entry)
-    return sorted(entries, key=lambda entry: -entry["solid_angle_sr"])
+    for k, part in enumerate(np.split(pixels, ends[:-1])[:count]):
+        center, extent = _box(_directions(part, numbers.shape, camera_matrix))
+        extent = extent + math.pi / numbers.shape[0]  # between outer edges of pixels
+        entries.append(
+            {
+                "number": k + 1,
+                "class": class_names[objects.classes[k]],
+                "score": round(float(objects.scores[k]), 4),
+                **dict(zip(_BOX, np.degrees([*center, *extent]).round(2).tolist(), strict=True)),
+            }
+        )
+    angles = solid_angles(numbers, count, camera_matrix).tolist()
+    for entry, angle in zip(entries, angles, strict=True):
+        entry["solid_angle_sr"] = float(f"{angle:.4g}")
+    return entries
+
+
+def _directions(pixels: NDArray[np.intp], shape: tuple[int, ...], camera_matrix: Matrix) -> Floats:
+    """Return the directions ``(n, 3)`` of pixels, flat indices; x is straight ahead in a photo."""
+    row, column = np.unravel_index(pixels, shape)
+    if camera_matrix is None:
+        size = shape[0], shape[1]
+        return lonlat_to_xyz(equirect_to_lonlat(np.stack([column, row], axis=-1), size))
+    x, y, z = np.linalg.inv(camera_matrix) @ np.stack([column, row, np.ones(len(row))])
+    return np.stack([z, x, -y], axis=-1) / np.sqrt(x**2 + y**2 + z**2)[:, None]
 
 
 def _box(directions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -57,7 +57,12 @@ def colorize_distance(
     return np.where(is_known[..., None], colors, UNKNOWN_COLOR)
 
 
-def mixed_picture(rgb: _Image, labels: NDArray[np.integer], class_names: tuple[str, ...]) -> _Image:
+def mixed_picture(
+    rgb: _Image,
+    labels: NDArray[np.integer],
+    class_names: tuple[str, ...],
+    segments: NDArray[np.integer] | None = None,
+) -> _Image:
     """Overlay the lightness of a picture with its labels.
 
     The colors of the picture would change those of the classes and are left out. Class colors are
@@ -67,12 +72,14 @@ def mixed_picture(rgb: _Image, labels: NDArray[np.integer], class_names: tuple[s
         rgb: RGB picture ``(H, W, 3)``.
         labels: Labels ``(H, W)``; unknown pixels (0) show the picture, gray where it is black.
         class_names: Names of the K + 1 labels.
+        segments: ``(H, W)`` numbers, between which borders are drawn; None for those of the labels.
     """
     light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     colors = class_colors(class_names)[labels]
     mixed = cv2.addWeighted(light, 0.5, colors, 0.5, 0)
     for axis in (0, 1):
-        is_border = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
+        parts = labels if segments is None else segments
+        is_border = np.diff(parts, axis=axis, prepend=parts.take([0], axis)) != 0
         mixed[is_border] = colors[is_border]
     mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
     mixed[(labels == UNKNOWN) & ~rgb.any(axis=-1)] = UNKNOWN_COLOR

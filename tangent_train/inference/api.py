@@ -58,6 +58,7 @@ from tangent_train.io.gpano import Eye, Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
+from tangent_train.metrics.panoptic import LABEL
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
 from tangent_train.rendering.forward import check_grid, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic, blend_back
@@ -239,7 +240,35 @@ class Network:
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
         given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye)
         found = self._predictor.predict(given).pixels().cpu().numpy()
+        if self.loaded.things:
+            found = (found // LABEL).astype(np.uint8)
         return _as_given(_masked(found, given, image, mask, 0), image)
+
+    def panoptic(
+        self, image: _Stored, **settings: Any
+    ) -> tuple[NDArray[np.int32], list[dict[str, Any]]]:
+        """Return the label and the object of every pixel, and a table of the objects.
+
+        Args:
+            image: A panorama, or a photo.
+            **settings: Arguments of `labels`, except ``mask``.
+
+        Returns:
+            ``(H, W)`` panoptic map, see `metrics.panoptic`, in which the label is ``map // 65536``
+            and the number of the object ``map % 65536``, 0 for none; and a table of the objects,
+            see `heads.objects.described`.
+
+        Raises:
+            DataError: See `labels`.
+            SettingError: See `labels`; or the network returns no objects.
+        """
+        if not self.loaded.things:
+            expected = "a network of tangent-import with things="
+            raise SettingError("network", found="one without objects", expected=expected)
+        given = self._read(image, **settings)
+        mosaic = self._predictor.predict(given)
+        found = given.cut(mosaic.pixels().cpu().numpy())
+        return found, mosaic.facts["objects"]
 
     @overload
     def depth(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
@@ -553,5 +582,7 @@ def map_classes(
     }
     parts = [f"{target} ← {', '.join(of)}" for target, of in classes.items() if of]
     parts += [f"{text}: {', '.join(of)}" for text, of in described.items() if of]
-    changed = replace(loaded, class_names=("unknown", *targets), groups=tuple(given))
+    things = tuple(target for target, of in classes.items() if set(of) & set(loaded.things))
+    names = ("unknown", *targets)
+    changed = replace(loaded, class_names=names, groups=tuple(given), things=things)
     return MappedNetwork(changed, classes, shorten("; ".join(parts), 600, placeholder=" …"))

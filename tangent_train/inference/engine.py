@@ -299,6 +299,8 @@ class Predictor:
         count = sum(len(views) for views, _, _ in sets)
         for views, scores, outputs in scored_views(network, sets, per_forward):
             mosaic.add(scores, views)
+            if "segments" in outputs and hasattr(mosaic, "add_segments"):
+                mosaic.add_segments(outputs["segments"], views)
             if "rotation_error_deg" in outputs:
                 mosaic.facts["rotation_error_deg"] = outputs["rotation_error_deg"]
             progress(len(views) / count)

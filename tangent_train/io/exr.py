@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import DataError, of_extra
+from tangent_train.errors import DataError, listed, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.io.image_files import MOST_PIXELS
 
@@ -110,12 +110,12 @@ def _chosen_names(
     elif colors and not indices:
         choices, expected = colors, "one layer with the channels R, G and B"
     if len(choices) != 1:
-        listed = ", ".join(names[:_MOST_NAMED]) + "…" * (len(names) > _MOST_NAMED)
+        known = listed(names, _MOST_NAMED)
         raise DataError(
             path,
             found="; ".join(", ".join(one) for one in choices) or "none",
             expected=expected,
-            remedy=f"Name one with depth_channel=, for training data data.depth_channel=: {listed}",
+            remedy=f"Name one with depth_channel=, for training data data.depth_channel=: {known}",
         )
     return choices[0]
 

@@ -26,13 +26,13 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from tangent_train.geometry import equirect_solid_angles
+from tangent_train.metrics.image_sums import seam_step
 from tangent_train.metrics.scores import BAND_EDGES_DEG, band_of_rows, defined_mean
 from tangent_train.metrics.sphere import (
     REGIONS,
     SEAM_SUMS,
     beside_seam,
     row_weights,
-    seam_step,
     seam_sums,
 )
 

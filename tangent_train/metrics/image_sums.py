@@ -17,7 +17,6 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tangent_train.metrics.scores import Interval, by_solid_angle, defined_mean
-from tangent_train.metrics.sphere import seam_step
 
 AbsentClass = Literal["skip", "zero"]
 """Treatment of a class without labeled pixels: left out of means, or counted as 0."""
@@ -78,6 +77,14 @@ def class_scores(
         name: np.where(truth > 0, hits / np.maximum(area, 1e-300), missing)
         for name, area in areas.items()
     }
+
+
+def seam_step(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the seam step, given results ``(…, 6)`` of `seam_sums`; NaN without known pairs."""
+    parts = sums.reshape(*sums.shape[:-1], 2, 3)
+    excess = (parts[..., 0] - parts[..., 1]) / np.where(parts[..., 2] > 0, parts[..., 2], np.nan)
+    step: NDArray[np.float64] = excess[..., 0] - excess[..., 1]
+    return step
 
 
 def mean_scores(

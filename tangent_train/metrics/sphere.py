@@ -48,7 +48,7 @@ def beside_seam(width: int) -> NDArray[np.intp]:
 def seam_sums(
     predicted: NDArray[Any], true: NDArray[Any], known: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Sum the disagreement of neighbors in a row, see `seam_step`.
+    """Sum the disagreement of neighbors in a row, see `metrics.image_sums.seam_step`.
 
     Args:
         predicted: ``(H, W)`` disagreement of each pixel with its right neighbor.
@@ -66,14 +66,6 @@ def seam_sums(
         across.append(angles @ counted[:, -1])
         others.append(angles @ counted[:, :-1].sum(axis=1))
     return np.array([*across, *others])
-
-
-def seam_step(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the seam step, given results ``(…, 6)`` of `seam_sums`; NaN without known pairs."""
-    parts = sums.reshape(*sums.shape[:-1], 2, 3)
-    excess = (parts[..., 0] - parts[..., 1]) / np.where(parts[..., 2] > 0, parts[..., 2], np.nan)
-    step: NDArray[np.float64] = excess[..., 0] - excess[..., 1]
-    return step
 
 
 def near_boundary(labels: NDArray[np.uint8]) -> NDArray[np.bool_]:

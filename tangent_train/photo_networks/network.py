@@ -33,6 +33,7 @@ class PhotoNetwork:
         image_size: Rows and columns of the training images.
         score_kind: Kind of the network's output if its library declares it, see `usual_kind`.
         depth_kind: Kind of depth that the network predicts; None for classes.
+        things: Names of the scores of which the network also returns objects, see `Segments`.
     """
 
     module: nn.Module
@@ -42,6 +43,7 @@ class PhotoNetwork:
     image_size: tuple[int, int] = USUAL_SIZE
     score_kind: ScoreKind | None = None
     depth_kind: DepthKind | None = None
+    things: Sequence[str] = ()
 
 
 _WEIGHTS = "model.safetensors"

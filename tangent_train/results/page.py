@@ -56,6 +56,8 @@ class EncodedImage(NamedTuple):
         shares: ``(label, share of the truth, share of the prediction)`` of the labels that occur,
             the largest first, without shares of missing maps; by solid angle for panoramas.
         scale: Scale of the distances, see `pack_distances`; None for labels.
+        objects: Description of each object by its number, which is the green channel of the PNG of
+            predicted labels; None for a gray PNG.
     """
 
     name: str
@@ -70,6 +72,7 @@ class EncodedImage(NamedTuple):
     confidence: bytes | None = None
     shares: Sequence[Sequence[float]] = ()
     scale: Mapping[str, Any] | None = None
+    objects: Mapping[int, str] | None = None
 
 
 def encode_image(
@@ -80,6 +83,8 @@ def encode_image(
     prediction: NDArray[Any] | None = None,
     truth: NDArray[Any] | None = None,
     confidence: NDArray[np.floating] | None = None,
+    numbers: NDArray[np.integer] | None = None,
+    objects: Mapping[int, str] | None = None,
     is_metric: bool = True,
     camera_matrix: NDArray[np.float64] | None = None,
     sphere: bool = True,
@@ -99,6 +104,8 @@ def encode_image(
             distances from the center, which are z-depth with `camera_matrix`.
         truth: True labels or distances ``(h, w)``; 0 and NaN are unknown.
         confidence: Confidence ``(h, w)`` of predicted labels, from 0 to 1.
+        numbers: Numbers ``(h, w)`` of predicted objects, 0 for none; None without objects.
+        objects: Description of each object by its number; those above 255 are not shown.
         is_metric: True for distances in meters; False for distances up to a scale.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers, for points.
         sphere: True for a panorama.
@@ -116,6 +123,11 @@ def encode_image(
         shares = np.array([_shares(labels, class_count, sphere=sphere) for labels in maps.values()])
         seen = [(k, *of) for k, of in enumerate(shares.T.tolist()) if any(of)]
         more["shares"] = sorted(seen, key=lambda entry: -max(entry[1:]))
+        if numbers is not None:
+            shown = np.where(numbers < 256, numbers, 0).astype(np.uint8)
+            green, red = _shrunk(shown, side, cv2.INTER_NEAREST_EXACT), maps["prediction"]
+            maps["prediction"] = np.stack([0 * red, green, red], axis=-1)
+            more["objects"] = objects
     elif maps:
         camera = None
         if camera_matrix is not None:  # in widths and heights from the upper left corner

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from datamodules.core.label_map import UNKNOWN_NAME
 from tangent_train.errors import counted
 from tangent_train.files import csv_text, write_text
@@ -40,13 +42,16 @@ def encode_prediction(
         predicted: Image with its prediction.
         confidence: Confidence of the labels in the whole image.
     """
-    image, pixels, _ = predicted
+    image, maps = predicted.image, head.report_maps(predicted)
+    if image.area is not None:
+        arrays = {k: image.area.place(m) for k, m in maps.items() if isinstance(m, np.ndarray)}
+        maps |= arrays
     note = "" if confidence is None else f"mean confidence {100 * confidence.mean():.0f}\u00a0%"
     return encode_image(
         name,
         image.rgb,
         len(head.class_names),
-        prediction=pixels if image.area is None else image.area.place(pixels),
+        **maps,
         confidence=confidence,
         note=note,
         is_metric=head.is_metric,
@@ -107,7 +112,7 @@ class PredictionFolder:
                 write_video(file, video.path, video.size, partial(painted, kind), every, video.part)
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
-        """Write ``summary.json``, ``summary.csv`` and, for labels, ``classes.json``.
+        """Write ``summary.json``, ``summary.csv``, for labels ``classes.json``, and other tables.
 
         Args:
             settings: Settings of the prediction.
@@ -115,6 +120,7 @@ class PredictionFolder:
         """
         content = {**settings, "images": entries}
         write_text(self.path / "summary.json", json.dumps(content, indent=1) + "\n")
+        self.head.write_tables(self.path, entries)
         labels: dict[str, list[int]] = {}
         for label, name in enumerate(map(composed, self.head.class_names)):
             if name != UNKNOWN_NAME:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tangent_train.errors import listed
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.metrics.scores import SOLID_ANGLE
 from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation import EvaluationResult
+from tangent_train.results.paired import Difference, difference
 from tangent_train.results.published import published_rows
 from tangent_train.results.rows import Part, RunRow, check_alike, group_results
 from tangent_train.results.tables import Table, markdown_text, score_text
@@ -24,6 +28,10 @@ _LEGEND = (
     "in brackets that over seeds within a fold."
 )
 _LEGEND_OF_INTERVALS = "[…] of a single run: 95 % bootstrap interval over its images."
+_LEGEND_OF_DIFFERENCES = (
+    "Percentages differ in points. […]: 95 % bootstrap interval; each draw has the same images in "
+    "both runs."
+)
 _CHANGE = "over the folds and seeds that both have."
 _REPRESENTATIONS = {
     "Cubemap": "cube map",
@@ -45,6 +53,7 @@ class Report:
         cells: Cell of a row in a table of views and conditions, by the row's label. The table is
             written only if there are several conditions.
         label: Returns the label of a row in the chart.
+        base: Label of the row from which others differ, see `RunRow.difference`.
     """
 
     title: str
@@ -53,6 +62,7 @@ class Report:
     compared: str = ""
     cells: Mapping[str, Cell] = field(default_factory=dict)
     label: Callable[[str], str] = str
+    base: str = ""
 
     @property
     def first(self) -> EvaluationResult:
@@ -65,8 +75,9 @@ class Report:
         return "Percent. " * in_percent + _LEGEND
 
     def tables(self) -> list[Table]:
-        """Return the tables of views, of means, on the sphere, of classes and of latitude bands."""
-        first, tables = self.first, [self._views(), self.means(), self.sphere()]
+        """Return the tables of views, means, differences, the sphere, classes and latitudes."""
+        first, tables = self.first, [self._views(), self.means()]
+        tables += [self.differences(), self.sphere()]
         for name, mean in first.class_means.items():
             if not name.endswith(SOLID_ANGLE):
                 title = first.columns[mean].class_title
@@ -118,6 +129,23 @@ class Report:
         notes = (common, self._legend, _LEGEND_OF_INTERVALS * has_intervals, self.compared)
         cells = list(zip(*cells_of, strict=True))
         return Table(self.title, header, cells, " ".join(filter(None, notes)), texts)
+
+    def differences(self) -> Table:
+        """Return the table of the differences from the first run; no rows without differences."""
+        found = [(row, row.difference) for row in self.rows if row.difference is not None]
+        columns = {
+            name: column
+            for name, column in self.first.columns.items()
+            if (column.is_main or column.of_sphere) and any(name in of.scores for _, of in found)
+        }
+        rows = []
+        for row, of in found:
+            count = row.results[0].images
+            images = f"{of.images} of {count}" if of.images < count else str(count)
+            cells = (_signed(of, name, column.unit) for name, column in columns.items())
+            rows.append((row.label, images, *cells))
+        header = ("", self.first.noun, *(column.title for column in columns.values()))
+        return Table(f"Difference from {self.base}", header, rows, _LEGEND_OF_DIFFERENCES)
 
     def sphere(self, condition: str | None = None) -> Table:
         """Return the table of the scores that only panoramas have; no rows without such scores.
@@ -172,6 +200,8 @@ class Report:
                     south, north = part if isinstance(part, tuple) else (None, None)
                     score = row.score(name, part, fold)._asdict()
                     low, high = score.pop("interval") or (None, None)
+                    found = row.difference if fold is None and part is None else None
+                    ends = found.intervals.get(name) if found else None
                     yield {
                         "row": row.label,
                         **row.facts,
@@ -184,6 +214,10 @@ class Report:
                         "low": low,
                         "high": high,
                         "ratio": row.ratio(name, part, fold),
+                        "difference": found and found.scores.get(name),
+                        "difference_low": ends and ends[0],
+                        "difference_high": ends and ends[1],
+                        "difference_images": found and found.images,
                     }
 
     def _markdown(self) -> str:
@@ -210,8 +244,17 @@ def _change(ratio: float | None) -> str:
     return f"{rounded:+.1f} %".replace("-", "−")
 
 
+def _signed(found: Difference, name: str, unit: str) -> str:
+    """Return a difference with its sign and its interval."""
+    score = found.scores.get(name, math.nan)
+    text = score_text(None if math.isnan(score) else score, unit, found.intervals.get(name))
+    return "+" * (score > 0) + text
+
+
 def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) -> Report:
     """Report the mean and spread of each group of finished runs, with published scores.
+
+    Rows of a single run have differences from the first row, if that is of a single run too.
 
     Args:
         results: Results of the runs.
@@ -227,6 +270,18 @@ def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) 
         if name not in ("data", "classes") and len({p.get(name) for p in protocols}) > 1
     ]
     rows, sources = _rows(group_results(results), shown)
+    base, reasons = rows[0], defaultdict(list)
+    for place, row in enumerate(rows[1:], start=1):
+        if len(row.results) == len(base.results) == 1:
+            found = difference(row.results[0], base.results[0])
+            if isinstance(found, Difference):
+                rows[place] = replace(row, difference=found)
+            else:
+                reasons[found].append(row.label)
+    missing = [
+        f"{listed(labels)}: no difference from {base.label}: {reason}."
+        for reason, labels in reasons.items()
+    ]
     rows.sort(
         key=lambda row: (
             row.facts["data"],
@@ -234,7 +289,7 @@ def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) 
             not row.label.endswith("(paper)"),
         )
     )
-    return Report("Report", rows, [*sources, *notes])
+    return Report("Report", rows, [*sources, *missing, *notes], base=base.label)
 
 
 def transfer_report(

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from tangent_train.errors import DataError
 from tangent_train.metrics.scores import SOLID_ANGLE, Interval
 from tangent_train.results.evaluation import RESULTS_FILE, Band, EvaluationResult
+from tangent_train.results.paired import Difference
 
 Part = str | Band | None
 """Name of a class, or a latitude band; None for all images."""
@@ -84,6 +85,7 @@ class RunRow:
         facts: Further columns of the tables, by title.
         results: Evaluations; empty for published scores.
         partner: Row that the scores are compared with.
+        difference: Difference of a single run from another, over the images that both have.
     """
 
     label: str
@@ -91,6 +93,7 @@ class RunRow:
     facts: Mapping[str, str] = field(default_factory=dict)
     results: Sequence[EvaluationResult] = ()
     partner: RunRow | None = None
+    difference: Difference | None = None
 
     @classmethod
     def of(

@@ -242,7 +242,10 @@ def test_a_share_of_each_class_is_kept_below_the_least_confidence(
         ({"max_tilt_deg": 90}, "max_tilt_deg: found 90.0; expected 60: nothing reads it"),
         ({"unmapped": "never"}, "unmapped: found never; expected unknown: nothing reads it"),
         ({"align": "scale"}, "align: found scale; expected null: nothing reads it"),
-        ({"projection": "perspective", "mask": -30}, "mask: found -30.0; expected null: nothing"),
+        (
+            {"projection": "perspective", "mask": -30},
+            r"mask: found \(-30.0,\); expected null: nothing",
+        ),
         ({"projection": "perspective", "rotations": 2}, "rotations: found"),
         ({"label_map": "night"}, "label_map: found 'night'; expected 'ade20k_to_cityscapes'"),
     ],

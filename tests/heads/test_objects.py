@@ -102,7 +102,7 @@ def test_masks_of_one_view_never_join() -> None:
     cut = int(numbers.nonzero()[:, 1].float().quantile(0.7))
     split = numbers * (1 + (columns > cut).int())
     segments[0] = Segments(split, torch.zeros(2, dtype=torch.int64), torch.ones(2))
-    found = join_objects([(views, segments)], SHAPE, 0.1)
+    found = join_objects([(views, segments)], SHAPE, least_overlap=0.1)
     sizes = np.bincount(found.numbers.ravel())[1:]
     assert len(sizes) == 2
     assert sizes.max() > 0.7 * sizes.sum()
@@ -136,12 +136,11 @@ def test_scores_are_means_by_solid_angle() -> None:
 def test_boxes_of_discs(disc: Any) -> None:
     longitude, latitude, radius, _ = disc
     numbers = numbers_at(equirect_directions((512, 1024)), [disc])
-    distance = np.where(numbers > 0, 2.5, np.nan)
-    (entry,) = described(Objects(numbers, np.zeros(1, int), np.ones(1)), ["lamp"], distance)
+    (entry,) = described(Objects(numbers, np.zeros(1, int), np.ones(1)), ["lamp"])
     center = lonlat_to_xyz(np.radians([entry["longitude_deg"], entry["latitude_deg"]]))
     assert center @ lonlat_to_xyz(np.radians([longitude, latitude])) > np.cos(np.radians(0.2))
     assert entry["width_deg"] == pytest.approx(2 * radius, abs=0.4)
     assert entry["height_deg"] == pytest.approx(2 * radius, abs=0.4)
     cap = 2 * np.pi * (1 - np.cos(np.radians(radius)))
     assert entry["solid_angle_sr"] == pytest.approx(cap, rel=0.02)
-    assert (entry["class"], entry["distance"]) == ("lamp", 2.5)
+    assert entry["class"] == "lamp"

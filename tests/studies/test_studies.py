@@ -16,6 +16,7 @@ from studies.constant_depth import constants
 from studies.depth_alignment import depth_alignment
 from studies.distorted_digits import BODY, distort, enlarge, mean_enlargement, pixel_centers
 from studies.fov import fov
+from studies.measures import MEASURES, closed_forms
 from studies.methods import KINDS, picture, table
 from studies.output import markdown
 from studies.point_views import SIDE, drawn, titled
@@ -202,3 +203,25 @@ def test_strips_are_a_data_set_of_the_horizon(tmp_path: Path) -> None:
             image = cv2.imread(str(tmp_path / "strips" / folder / f"{name}.png"), 0)
             assert image is not None
             assert image.shape == (50, 256)
+
+
+def test_the_measures_of_known_predictions_are_on_their_page() -> None:
+    page = (DOCS / "explanation" / "measures.md").read_text(encoding="utf-8")
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines()]
+    rows = {str(row["prediction"]): row for row in closed_forms()}
+    for name, row in rows.items():
+        cells = [f"{row[m]:.1f}" if row[m] != "" else "" for m in MEASURES]
+        assert [name, *(c.replace("-0.0", "0.0").replace("-", "−") for c in cells)] in lines
+    cap, shift = 1 - math.cos(math.radians(30)), 3 / 1024 * 180  # three rows
+    ious = {
+        "class 1 within 30° of the poles": (1 / (1 + cap) + 1 - cap) / 2,
+        "class 1 in 9° east of the seam": (180 / 189 + 171 / 180) / 2,
+        "a boundary off by 0.5°": 1 - math.sin(math.radians(shift)),
+    }
+    for name, iou in ious.items():
+        assert rows[name]["miou_solid_angle"] == pytest.approx(100 * iou, abs=0.1)
+    assert rows["a boundary off by 0.5°"]["boundary_miou"] == pytest.approx(100 / 3, abs=0.01)
+    west = rows["class 1 in 9° east of the seam"]
+    assert (west["seam_step"], west["seam_gap"]) == pytest.approx((100 - 100 / 2047, -25))
+    ramp = rows["distances that grow from 1 m to 2 m"]
+    assert ramp["seam_step"] == pytest.approx(100 * math.log(2) * (1 - 2 / 2048))

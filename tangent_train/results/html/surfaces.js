@@ -282,7 +282,8 @@ class FlatSurface {
 
   isOutline(k) {
     const map = this.distances ? [] : (this.pixels.prediction ?? this.pixels.truth ?? []);
-    return [4, 4 * this.sheet.width].some((step) => k + step < map.length && map[k] !== map[k + step]);
+    const differs = (step) => map[k] !== map[k + step] || map[k + 1] !== map[k + step + 1];
+    return [4, 4 * this.sheet.width].some((step) => k + step < map.length && differs(step));
   }
 
   // One pixel, as in the shader.

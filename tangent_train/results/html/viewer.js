@@ -256,6 +256,8 @@ class Viewer {
     const bytes = this.surface.valueAt(kind, at);
     if (!bytes) return null;
     if (kind === "confidence") return `${kind}: ${Math.round(bytes[0] / 2.55)} %`;
+    const object = kind === "prediction" && this.data.objects?.[bytes[1]];
+    if (object) return `${nameOf(kind)}: ${object}`;
     if (!this.distances) return `${nameOf(kind)}: ${this.classes[bytes[0]]?.name ?? bytes[0]}`;
     const log = this.distances.log(bytes[0], bytes[1]);
     return `${nameOf(kind)}: ${log === null ? "unknown" : this.distances.text(Math.exp(log))}`;

@@ -1,0 +1,189 @@
+"""Head for classes of which some are single objects: chairs, not walls."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import find_objects
+from torch import Tensor
+
+from models.segments import Segments
+from tangent_train.files import csv_text, write_text
+from tangent_train.heads import pictures
+from tangent_train.heads.base import PICTURES, RGB, PredictedImage
+from tangent_train.heads.classes import ClassesHead, LabelMosaic
+from tangent_train.heads.objects import OBJECT_COLUMNS, described, join_objects
+from tangent_train.io.pixel_files import read_pixels, write_pixels
+from tangent_train.metrics.panoptic import LABEL
+from tangent_train.rendering.representations.views import Views
+
+_BYTE = 256
+
+
+class PanopticHead(ClassesHead):
+    """Classes for every pixel, and objects of some of them, see `heads.objects`.
+
+    Predicted pixels are panoptic maps, see `metrics.panoptic`. The labels of objects replace those
+    of the blended scores. Elsewhere, a class of `things` has no object: number 0.
+
+    Args:
+        class_names: Names of the K + 1 labels, the unknown class first.
+        things: Names of the classes that have objects.
+        **settings: See `ClassesHead`.
+    """
+
+    waits: ClassVar[bool] = True  # objects are joined while the next image is predicted
+    usual_kinds: ClassVar[Sequence[str]] = ("labels", *PICTURES)
+    suffixes = MappingProxyType(
+        dict.fromkeys(("panoptic", "labels", "objects"), ".png") | ClassesHead.suffixes
+    )
+
+    def __init__(
+        self, class_names: Sequence[str], things: Collection[str], **settings: Any
+    ) -> None:
+        super().__init__(class_names, **settings)
+        self.is_thing = np.isin(self.class_names, list(things))
+
+    def _new_mosaic(self, *given: Any, **settings: Any) -> PanopticMosaic:
+        return PanopticMosaic(self, *given, **settings)
+
+    def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
+        """Write a panoptic map in COCO's colors, labels, 16-bit numbers of objects and pictures."""
+        codes = predicted.pixels
+        if file := files.get("labels"):
+            write_pixels(file, (codes // LABEL).astype(np.uint8))
+        if file := files.get("objects"):
+            write_pixels(file, (codes % LABEL).astype(np.uint16))
+        shown = {kind: file for kind, file in files.items() if kind in (self.source, *PICTURES)}
+        super().write(shown, predicted)
+
+    def write_source(self, file: Path, pixels: NDArray[Any]) -> None:
+        """Write a panoptic map as RGB: ``R + 256 G + 65536 B``; 0 where a thing has no object."""
+        is_none = self.is_thing[pixels // LABEL] & (pixels % LABEL == 0)
+        codes = np.where(is_none, 0, pixels).astype(np.uint32)
+        write_pixels(
+            file, np.stack([codes >> shift & 255 for shift in (0, 8, 16)], -1).astype("u1")
+        )
+
+    def read(self, file: Path) -> NDArray[np.int32]:
+        """Read a panoptic map."""
+        return read_pixels(file, indices=False) @ np.array([1, _BYTE, LABEL], np.int32)
+
+    def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> RGB:
+        """Color the labels, or overlay the image with them and the borders of objects."""
+        labels = pixels // LABEL
+        if kind == "color":
+            return super().paint(kind, rgb, labels)
+        return pictures.mixed_picture(rgb, labels, self.class_names, pixels)
+
+    def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> RGB:
+        """Return a picture; an overlay has a legend of the classes."""
+        painted, labels = self.paint(kind, rgb, pixels), pixels // LABEL
+        if kind == "color":
+            return painted
+        return pictures.with_class_legend(painted, labels[labels > 0], self.class_names)
+
+    def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
+        """Return labels, numbers of objects, and their descriptions."""
+        labels, numbers = np.divmod(predicted.pixels, LABEL)
+        text = (
+            "{class} {number}, score {score:.2f}, {width_deg:.1f}° × {height_deg:.1f}°".format_map
+        )
+        objects = [segment for segment in predicted.facts["segments"] if "number" in segment]
+        texts = {segment["number"]: text(segment) for segment in objects}
+        return {"prediction": labels, "numbers": numbers, "objects": texts}
+
+    def entry(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> dict[str, Any]:
+        """Return the shares of the classes, and COCO's ``segments_info`` with the table of objects.
+
+        Segments that are masked are left out.
+        """
+        codes, of_number = predicted.pixels, {e["number"]: e for e in predicted.facts["objects"]}
+        ids, index, counts = np.unique(codes, return_inverse=True, return_counts=True)
+        boxes = find_objects(index.reshape(codes.shape) + 1)
+        segments = []
+        for code, count, (rows, columns) in zip(ids.tolist(), counts.tolist(), boxes, strict=True):
+            label, number = divmod(code, LABEL)
+            if number or (label and not self.is_thing[label]):
+                size = columns.stop - columns.start, rows.stop - rows.start
+                box = [columns.start, rows.start, *size]
+                segment = {"id": code, "category_id": label, "area": count, "bbox": box}
+                segments.append(segment | {"iscrowd": 0} | of_number.get(number, {}))
+        of_classes = predicted._replace(pixels=codes // LABEL)
+        return super().entry(of_classes, is_counted) | {"segments": segments}
+
+    def write_tables(self, folder: Path, entries: Sequence[Mapping[str, Any]]) -> None:
+        """Write ``panoptic.json`` in COCO's format, and ``objects.csv``."""
+        done = [entry for entry in entries if "segments" in entry]
+        content = {
+            "images": [
+                {"id": k, "file_name": e["file"], "width": e["columns"], "height": e["rows"]}
+                for k, e in enumerate(done)
+            ],
+            "annotations": [
+                {"image_id": k, "file_name": f"{e['name']}.png", "segments_info": e["segments"]}
+                for k, e in enumerate(done)
+            ],
+            "categories": [
+                {"id": label, "name": name, "isthing": int(self.is_thing[label])}
+                for label, name in enumerate(self.class_names)
+                if label
+            ],
+        }
+        write_text(folder / "panoptic.json", json.dumps(content) + "\n")
+        objects = [{"image": e["name"], **s} for e in done for s in e["segments"] if "number" in s]
+        names = ["image", *OBJECT_COLUMNS]
+        write_text(folder / "objects.csv", csv_text(names, objects))
+
+
+class PanopticMosaic(LabelMosaic):
+    """Probabilities of classes and objects of views, from which `pixels` are a panoptic map.
+
+    Attributes:
+        facts: ``objects`` is a table of the objects, after `pixels`.
+    """
+
+    def __init__(
+        self, head: PanopticHead, *given: Any, camera_matrix: Any = None, **named: Any
+    ) -> None:
+        super().__init__(head, *given, **named)
+        # With that of the class −1 at the end.
+        self._camera_matrix, self._things = camera_matrix, np.append(head.is_thing[1:], False)
+        self._sets: list[tuple[Views, Sequence[Segments]]] = []
+        self._objects: list[dict[str, Any]] = []
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Objects, and the share of pixels without a class."""
+        return {**super().facts, "objects": self._objects}
+
+    def add_segments(self, segments: Sequence[Segments], views: Views) -> None:
+        """Add the objects of some views."""
+        self._sets.append((views, list(map(self._chosen, segments))))
+
+    def _chosen(self, segments: Segments) -> Segments:
+        """Return the objects of the classes that have objects."""
+        things = torch.from_numpy(self._things).to(segments.classes.device)
+        is_chosen = things[segments.classes]
+        table = torch.cat([is_chosen.new_zeros(1), is_chosen.cumsum(0) * is_chosen]).int()
+        numbers = table.index_select(0, segments.numbers.flatten()).view_as(segments.numbers)
+        return Segments(numbers, segments.classes[is_chosen], segments.scores[is_chosen])
+
+    def pixels(self) -> Tensor:
+        """Return a panoptic map ``(H, W)``, int32."""
+        labels = super().pixels().int()
+        found = join_objects(self._sets, self.shape, self._camera_matrix)
+        if self.valid is not None:
+            found = found._replace(numbers=np.where(self.valid, found.numbers, 0))
+        names = self._head.class_names[1:]
+        self._objects = described(found, names, self._camera_matrix)
+        numbers = torch.from_numpy(found.numbers).to(labels.device)
+        of_objects = torch.from_numpy(np.append(0, found.classes + 1)).to(labels)
+        return torch.where(numbers > 0, of_objects[numbers], labels) * LABEL + numbers

@@ -1,0 +1,58 @@
+"""Differences between evaluations of the same images, with paired intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tangent_train.metrics.image_sums import drawn_scores, intervals, means_of_sums
+from tangent_train.metrics.scores import Interval
+from tangent_train.results.evaluation import SUMS_FILE, EvaluationResult, read_image_sums
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Scores of an evaluation minus those of another, over the images that both have.
+
+    Attributes:
+        images: Number of these images.
+        scores: Differences of the scores by name.
+        intervals: Their 95 % bootstrap intervals over the images, see `metrics.image_sums`.
+    """
+
+    images: int
+    scores: Mapping[str, float]
+    intervals: Mapping[str, Interval]
+
+
+def difference(result: EvaluationResult, base: EvaluationResult) -> Difference | str:
+    """Return the difference of an evaluation from another, or the reason why there is none.
+
+    Args:
+        result: The evaluation.
+        base: Evaluation whose scores are subtracted; its images have the same names.
+    """
+    for name in ("data", "absent_class"):
+        if result.protocol.get(name) != base.protocol.get(name):
+            return f"their {name} differs"
+    try:
+        (names, sums), (others, of_base) = (read_image_sums(r.folder) for r in (result, base))
+    except OSError:
+        return f"{SUMS_FILE} is missing: evaluate again"
+    common, *places = np.intersect1d(names, others, return_indices=True)
+    if not common.size:
+        return "no image in common"
+    absent = base.protocol.get("absent_class", "skip")
+    pair = [
+        {name: values[shared] for name, values in of.items()}
+        for of, shared in zip((sums, of_base), places, strict=True)
+    ]
+    means, drawn = ([score(of, absent) for of in pair] for score in (means_of_sums, drawn_scores))
+    return Difference(len(common), _minus(*means), intervals(_minus(*drawn)))
+
+
+def _minus(scores: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: scores[name] - others[name] for name in scores.keys() & others.keys()}
