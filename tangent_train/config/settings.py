@@ -479,22 +479,8 @@ class TrainSettings(RunSettings):
     """your own packages whose classes a checkpoint may use, e.g. my_networks"""
 
 
-class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
-    """Settings of tangent-evaluate."""
-
-    not_read: ClassVar[Sequence[str]] = (
-        *("network", "optimizer", "scheduler", "callbacks", "recipe", "ema"),
-        *("checkpoint_every_n_steps", "validation_images", "data.color_jitter"),
-        "representation.(faces_per_panorama|mirror|random_rotation)",
-        "task.(auxiliary_weight|backbone_lr_factor|frozen|view_batch_size)",
-        "task.head.(class_weights|label_smoothing|loss|scale_invariance)",
-        "trainer.(accumulate|check|gradient|limit_(train|val)|log|max|min|num_sanity)_.*",
-        "trainer.(overfit|reload|sync|val)_.*",
-    )
-
-    checkpoint: ExistingPath | None = None  # type: ignore[assignment]
-    """network file, written by tangent-train, tangent-import or tangent-export; required without
-    predictions="""
+class FilesSettings(RunSettings):
+    """Settings of commands that read predictions of any program."""
 
     # --- predictions of any program ---
     predictions: ExistingPath | None = None
@@ -514,6 +500,24 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     """predictions: units per meter in depth files of integers"""
     depth_channel: str | None = None
     """predictions: channel of OpenEXR files; null = as tangent-predict"""
+
+
+class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
+    """Settings of tangent-evaluate."""
+
+    not_read: ClassVar[Sequence[str]] = (
+        *("network", "optimizer", "scheduler", "callbacks", "recipe", "ema"),
+        *("checkpoint_every_n_steps", "validation_images", "data.color_jitter"),
+        "representation.(faces_per_panorama|mirror|random_rotation)",
+        "task.(auxiliary_weight|backbone_lr_factor|frozen|view_batch_size)",
+        "task.head.(class_weights|label_smoothing|loss|scale_invariance)",
+        "trainer.(accumulate|check|gradient|limit_(train|val)|log|max|min|num_sanity)_.*",
+        "trainer.(overfit|reload|sync|val)_.*",
+    )
+
+    checkpoint: ExistingPath | None = None  # type: ignore[assignment]
+    """network file, written by tangent-train, tangent-import or tangent-export; required without
+    predictions="""
 
     # --- views ---
     representation: Section | None = None  # type: ignore[assignment]
@@ -610,7 +614,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
     "prepare": PrepareSettings,
-    "check": RunSettings,
+    "check": FilesSettings,
 }
 """Settings by the name of the command."""
 
