@@ -103,7 +103,7 @@ class DistanceHead(Head):
             "delta3": ScoreColumn("δ3", is_main=False),
             "missing": ScoreColumn("missing", better="lower", is_main=False),
         }
-    ) | sphere_columns("AbsRel", "", better="lower")
+    ) | sphere_columns("AbsRel", "", better="lower", distance="median change of distance")
     main_score: ClassVar[str] = "absrel"
     predict_settings = MappingProxyType(
         {"align": "", "depth_format": "depth", "depth_scale": "depth", "points": "points"}
@@ -219,6 +219,13 @@ class DistanceHead(Head):
             return as_sums(pixels)
         of_sphere = metrics.sphere_scores(result[:, metrics.SPHERE])
         return as_sums(pixels | by_solid_angle(angles) | of_sphere)
+
+    def agreement(self, first: PredictedImage, other: PredictedImage) -> dict[str, float]:
+        """Return the median of ``|d' / d − 1|``; d' is aligned with d as it is with the truth."""
+        before, after = (torch.from_numpy(image.pixels).double() for image in (first, other))
+        changes = (self.comparable(after, before) / before - 1).abs().numpy()
+        angles = np.array(first.solid_angles)
+        return {"distance": np.nanquantile(changes, 0.5, weights=angles, method="inverted_cdf")}
 
     @property
     def facts(self) -> dict[str, str]:
