@@ -64,7 +64,7 @@ class ClassesHead(Head):
         }
     ) | {
         "boundary_miou": ScoreColumn("mIoU near boundaries", is_main=False, of_sphere=True),
-        **sphere_columns("mIoU"),
+        **sphere_columns("mIoU", labels="equal labels", miou="mIoU with the first labels"),
     }
     main_score: ClassVar[str] = "miou"
     predict_settings = MappingProxyType({"min_confidence": "", "min_share": "min_confidence"})
@@ -173,6 +173,15 @@ class ClassesHead(Head):
         pixels, solid_angle = result.of_images.swapaxes(0, 1)
         of_sphere = {"solid_angle": solid_angle, "regions": result.regions, "seam": result.seam}
         return {"pixels": pixels, **(of_sphere if len(result.seam) else {})}
+
+    def agreement(self, first: PredictedImage, other: PredictedImage) -> dict[str, float]:
+        """Return the share of equal labels, and the mIoU over the classes of the first labels."""
+        k, angles = len(self.class_names), first.solid_angles
+        pairs = k * first.pixels.astype(np.int64) + other.pixels
+        counts = np.bincount(pairs.ravel(), angles.ravel(), k * k).reshape(k, k)
+        miou = segmentation.segmentation_scores(counts).means["miou"]
+        equal = np.average(first.pixels == other.pixels, weights=angles)
+        return {"labels": float(equal), "miou": miou}
 
     @property
     def facts(self) -> dict[str, str]:
