@@ -59,11 +59,9 @@ def _unused_folder_removed(command: str) -> Iterator[None]:
         yield
     except (DataError, SettingError):
         config = HydraConfig.get()
-        folder, is_typed = (
-            Path(config.runtime.output_dir),
-            "run.dir=" in str(config.overrides.hydra),
-        )
-        if not is_typed and {p.name for p in folder.iterdir()} - {f"{command}.log"} == {".hydra"}:
+        folder = Path(config.runtime.output_dir)
+        names = {path.name for path in folder.iterdir()} - {f"{command}.log"}
+        if names == {".hydra"} and "run.dir=" not in str(config.overrides.hydra):
             rmtree(folder)
         raise
 

@@ -101,14 +101,14 @@ def is_metric(kind: DepthKind) -> bool:
 def depth_of_output(
     output: Tensor, kind: DepthKind, ray_lengths: Tensor
 ) -> tuple[Tensor, DepthKind]:
-    """Convert `log_distance` and `canonical_inverse` to meters, and points to z-depth.
+    """Convert `log_distance` and canonical depth to meters, and points to z-depth.
 
     Other kinds are returned unchanged.
 
-    The canonical inverse depth C is divided by the focal length in image widths (Bochkovskii et al.
-    2024, section 3.2). That follows from the rays: at columns of distance d, the second difference
-    of 1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as
-    in the authors' code.
+    Canonical depth is multiplied by the focal length in image widths (Yin et al. 2023), its inverse
+    divided by it (Bochkovskii et al. 2024, section 3.2). That follows from the rays: at columns of
+    distance d, the second difference of 1 + x² is 2 (d p)², with the pitch p of pixels on the image
+    plane. From the inverse, depth is at most 10 km, as in the authors' code.
 
     A point at distance ρ from the optical axis has the z-depth z + t with ρ = q (z + t), where q =
     √(x² + y²) is known at its pixel (x, y) on the image plane at distance 1. The shift t of an
@@ -124,6 +124,8 @@ def depth_of_output(
     """
     if kind == "log_distance":
         return output.exp(), "metric_distance"
+    if kind == "canonical_z":
+        return output / _span(ray_lengths), "metric_z"
     if kind == "canonical_inverse":
         inverse = output.where(output.isfinite(), torch.nan) * _span(ray_lengths)
         return 1 / inverse.clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
@@ -182,6 +184,8 @@ def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Ten
         raise SettingError("depth_kind", found=kind, expected=expected)
     if kind == "log_distance":
         return distance.log()
+    if kind == "canonical_z":
+        return distance / ray_lengths * _span(ray_lengths)
     if kind == "canonical_inverse":
         return ray_lengths / (distance * _span(ray_lengths))
     values = 1 / distance if is_disparity(kind) else distance
@@ -440,14 +444,16 @@ def _pairs(samples: ViewSamples, is_valid: NDArray[np.bool_]) -> tuple[Indices, 
     return first[is_kept], second[is_kept]
 
 
-def _slopes(entries: Sequence[Floats], unknowns: Sequence[Indices], count: int) -> sparse.csr_array:
+def matrix_rows(
+    entries: Sequence[Floats], unknowns: Sequence[Indices], count: int
+) -> sparse.csr_array:
     """Return the ``(m, count)`` matrix with k entries in each row, at the numbers of unknowns."""
     values, columns = np.stack(entries, axis=-1), np.stack(unknowns, axis=-1)
     starts = np.arange(0, values.size + 1, len(entries))
     return sparse.csr_array((values.ravel(), columns.ravel(), starts), (len(values), count))
 
 
-def _robust_fit(
+def robust_fit(
     evaluate: Callable[[Floats], tuple[Floats, sparse.csr_array]],
     start: Floats,
     prior: sparse.csr_array | None = None,
@@ -486,8 +492,8 @@ def _fit_scales(pairs: _Pairs, logs: Floats, count: int) -> Floats:
     """Return scales ``(N,)``."""
     first, second, a, b = pairs
     ones, offset = np.ones(len(a)), logs[first] - logs[second]
-    slopes = _slopes([ones, -ones], [a, b], count)
-    return np.exp(_robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count)))
+    slopes = matrix_rows([ones, -ones], [a, b], count)
+    return np.exp(robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count)))
 
 
 def _fit_affine(
@@ -517,10 +523,10 @@ def _fit_affine(
             scale[a] * factor[first] / noise * has_shift[a],
             -scale[b] * factor[second] / noise * has_shift[b],
         ]
-        return residual, _slopes(entries, [a, b, count + a, count + b], 2 * count)
+        return residual, matrix_rows(entries, [a, b, count + a, count + b], 2 * count)
 
     prior = sparse.diags_array(np.repeat([1 / _SCALE_PRIOR, 1 / _SHIFT_PRIOR], count)).tocsr()
-    fit = _robust_fit(evaluate, np.concatenate([np.log(unit), np.zeros(count)]), prior)
+    fit = robust_fit(evaluate, np.concatenate([np.log(unit), np.zeros(count)]), prior)
     scale = np.exp(fit[:count])
     return scale / unit, scale * fit[count:], is_constant
 
@@ -541,7 +547,7 @@ def _fit_grid(pairs: _Pairs, logs: Floats, samples: ViewSamples) -> tuple[Floats
     small = sparse.vstack([smooth / _SLOPE_PRIOR, sparse.eye_array(nodes) / _NODE_PRIOR])
     prior = sparse.kron(sparse.eye_array(count), small).tocsr()
     start = np.zeros(count * nodes)
-    fit = _robust_fit(lambda x: (slopes @ x + offset, slopes), start, prior)
+    fit = robust_fit(lambda x: (slopes @ x + offset, slopes), start, prior)
     return fit.reshape(count, _NODES, _NODES), at_samples @ fit
 
 
