@@ -60,6 +60,7 @@ class OutputNetwork(nn.Module):
         num_outputs: Number of channels of the converted output, with `groups` their number.
         tile: See above.
         takes_cameras: True if the network takes views of a panorama with their cameras.
+        takes_all_views: True if it takes those of a panorama in one call.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class OutputNetwork(nn.Module):
         self._groups, self._kind, self._gain = groups, kind, gain
         named = signature(network.forward).parameters
         self.takes_cameras = "camera_matrix" in named
-        self._takes_all_views = "world_from_camera" in named
+        self.takes_all_views = "world_from_camera" in named
 
     def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Any:
         """Return the converted output ``(B, num_outputs, h, w)``.
@@ -114,7 +115,7 @@ class OutputNetwork(nn.Module):
             batch = settings.get("view_batch_size")
             arguments, settings = cameras_of_rays(arguments[0][0], tile), {}
         images = images if tile == size else _resized(images, tile)
-        if self.takes_cameras and not self._takes_all_views:
+        if self.takes_cameras and not self.takes_all_views:
             given = (torch.split(each, batch or len(images)) for each in (images, arguments[1]))
             parts = [named_outputs(self.network(*part)) for part in zip(*given, strict=True)]
             returned = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

@@ -154,6 +154,11 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """depth: align the views with each other: none | scale | affine | grid (scales that vary within
     a view); null = by the kind of depth"""
 
+    align_across: Literal["frames"] | ExistingPath | None = None
+    """depth: bring all panoramas to one scale: frames (of a video, or of a folder in order, each
+    near the next) | their poses, in whose unit depth is then (the JSON file of tangent-render
+    poses=, or a folder of a sparse COLMAP model); null = each has its own"""
+
     # --- output ---
     output: Path
     """folder for the results"""
@@ -479,22 +484,16 @@ class TrainSettings(RunSettings):
     """your own packages whose classes a checkpoint may use, e.g. my_networks"""
 
 
-class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
-    """Settings of tangent-evaluate."""
+class FilesSettings(RunSettings):
+    """Settings of commands that read predictions of any program."""
 
-    not_read: ClassVar[Sequence[str]] = (
-        *("network", "optimizer", "scheduler", "callbacks", "recipe", "ema"),
-        *("checkpoint_every_n_steps", "validation_images", "data.color_jitter"),
-        "representation.(faces_per_panorama|mirror|random_rotation)",
-        "task.(auxiliary_weight|backbone_lr_factor|frozen|view_batch_size)",
-        "task.head.(class_weights|label_smoothing|loss|scale_invariance)",
-        "trainer.(accumulate|check|gradient|limit_(train|val)|log|max|min|num_sanity)_.*",
-        "trainer.(overfit|reload|sync|val)_.*",
-    )
-
-    checkpoint: ExistingPath | None = None  # type: ignore[assignment]
-    """network file, written by tangent-train, tangent-import or tangent-export; required without
-    predictions="""
+    # --- consistency ---
+    consistency: NonNegativeInt = 0
+    """panoramas: compare predictions for this number of turns about the vertical, and for as many
+    random rotations, with the first prediction; 0 = none (8 with input=)"""
+    input: str | Path | None = None
+    """only consistency, of panoramas without labels, instead of data=: panorama or video, folder of
+    them, or pattern, e.g. 'holiday/*.jpg'"""
 
     # --- predictions of any program ---
     predictions: ExistingPath | None = None
@@ -514,6 +513,24 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     """predictions: units per meter in depth files of integers"""
     depth_channel: str | None = None
     """predictions: channel of OpenEXR files; null = as tangent-predict"""
+
+
+class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
+    """Settings of tangent-evaluate."""
+
+    not_read: ClassVar[Sequence[str]] = (
+        *("network", "optimizer", "scheduler", "callbacks", "recipe", "ema"),
+        *("checkpoint_every_n_steps", "validation_images", "data.color_jitter"),
+        "representation.(faces_per_panorama|mirror|random_rotation)",
+        "task.(auxiliary_weight|backbone_lr_factor|frozen|view_batch_size)",
+        "task.head.(class_weights|label_smoothing|loss|scale_invariance)",
+        "trainer.(accumulate|check|gradient|limit_(train|val)|log|max|min|num_sanity)_.*",
+        "trainer.(overfit|reload|sync|val)_.*",
+    )
+
+    checkpoint: ExistingPath | None = None  # type: ignore[assignment]
+    """network file, written by tangent-train, tangent-import or tangent-export; required without
+    predictions="""
 
     # --- views ---
     representation: Section | None = None  # type: ignore[assignment]
@@ -610,7 +627,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
     "prepare": PrepareSettings,
-    "check": RunSettings,
+    "check": FilesSettings,
 }
 """Settings by the name of the command."""
 
@@ -728,7 +745,7 @@ def _example(command: str) -> str:
 def missing_groups(command: str) -> list[str]:
     """Return ["data"] if the command line of a run chooses no data set, neither by experiment."""
     is_own = HydraConfig.get().job.config_name == command  # not that of a resumed run or a stage
-    chosen = any(is_within(name, ("data", "experiment")) for name in typed_names())
+    chosen = any(is_within(name, ("data", "experiment", "input")) for name in typed_names())
     needs_data = issubclass(SETTINGS[command], RunSettings) and is_own and not chosen
     return ["data"] * needs_data
 

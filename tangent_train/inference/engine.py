@@ -17,17 +17,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch.utils._pytree import tree_map_only
 
 from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import STEPS_PER_M, resize_depth
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
 from models.distortion_aware import make_ordinary
-from tangent_train.checkpoints.outputs import OutputNetwork, named_outputs, network_for_views
+from tangent_train.checkpoints.outputs import (
+    OutputNetwork,
+    named_outputs,
+    network_for_views,
+)
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid
+from tangent_train.geometry import TangentGrid, random_rotation, rotation_about
 from tangent_train.geometry.sphere import equirect_elevations
+from tangent_train.heads.base import PredictedImage
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import ViewSelector
+from tangent_train.metrics.scores import TURNS
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import CubemapRepresentation
 from tangent_train.rendering.resampling import resize
@@ -59,11 +66,10 @@ _LEAST = 1e-4
 
 
 def sees_rays(network: nn.Module) -> bool:
-    """Return True if a network takes all views with their rays or cameras in one call."""
-    is_converted = isinstance(network, OutputNetwork)
-    inner: Any = network.network if is_converted else network
-    takes_cameras = is_converted and network.takes_cameras
-    return bool(takes_cameras) or "rays" in inspect.signature(inner.forward).parameters
+    """Return True if a network takes viewing rays or cameras, e.g. for cross-image attention."""
+    inner: Any = network.network if isinstance(network, OutputNetwork) else network
+    takes_cameras = bool(getattr(network, "takes_cameras", False))
+    return takes_cameras or "rays" in inspect.signature(inner.forward).parameters
 
 
 def views_per_forward(image_size: tuple[int, int]) -> int:
@@ -73,32 +79,48 @@ def views_per_forward(image_size: tuple[int, int]) -> int:
 
 @torch.no_grad()
 def scored_views(
-    network: Callable[..., Any], sets: Iterable[ViewSet], per_forward: int
+    network: Callable[..., Any], sets: Iterable[ViewSet], per_forward: int, joins: bool = False
 ) -> Iterator[tuple[Any, Tensor, Mapping[str, Tensor]]]:
     """Yield views of one image with their scores, a few at a time.
 
     Args:
         network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict that contains
             them under ``"out"``, and for depth optionally ``"confidence"`` ``(n, 1, h, w)``. A
-            network that takes rays or cameras is called once for a set with rays, with all views:
+            network that takes rays is called once for a set with rays, with all views:
             ``network(images, rays[None])``.
         sets: Sets of views.
         per_forward: Number of views per call of the network.
+        joins: True to call the network once for all sets, see `OutputNetwork`.
 
     Yields:
         Views; their float32 scores ``(n, K, h, w)``, with the confidence as the last channel; and
         all outputs of the network by name.
     """
+    if joins:
+        given = list(sets)
+        whole = torch.cat([read(slice(0, len(views))) for views, read, _ in given])
+        known = [of for _, _, of in given if of is not None]
+        returned = network(whole, torch.cat(known)[None]) if known else network(whole)
+        scores, outputs = _with_confidence(returned)
+        starts = np.cumsum([0, *(len(views) for views, _, _ in given)])
+        for (views, _, _), start in zip(given, starts, strict=False):
+            yield views, scores[start : start + len(views)], outputs
+        return
     for views, images, rays in sets:
         step = per_forward if rays is None else len(views)
         for start in range(0, len(views), step):
             part = slice(start, min(start + step, len(views)))
             returned = network(images(part), *(() if rays is None else (rays[None],)))
-            outputs = named_outputs(returned)
-            scores = outputs["out"]
-            if "confidence" in outputs:
-                scores = torch.cat([scores, outputs["confidence"]], dim=1)
-            yield views[part], scores.float(), outputs
+            yield views[part], *_with_confidence(returned)
+
+
+def _with_confidence(returned: Any) -> tuple[Tensor, Mapping[str, Tensor]]:
+    """Return float32 scores, with a confidence as the last channel, and all outputs by name."""
+    outputs = named_outputs(returned)
+    scores = outputs["out"]
+    if "confidence" in outputs:
+        scores = torch.cat([scores, outputs["confidence"]], dim=1)
+    return scores.float(), outputs
 
 
 def upright_rays(
@@ -254,10 +276,9 @@ class Predictor:
             return network
         compiled: Any = torch.compile(network, **self._compile)
         # The next call of a CUDA graph overwrites the output of the last.
-        return lambda *given, **named: {
-            name: output.clone()
-            for name, output in named_outputs(compiled(*given, **named)).items()
-        }
+        return lambda *given, **named: tree_map_only(
+            torch.Tensor, torch.clone, dict(named_outputs(compiled(*given, **named)))
+        )
 
     @torch.no_grad()
     def predict(
@@ -297,7 +318,8 @@ class Predictor:
         if self._sees_rays:
             network = partial(network, view_batch_size=per_forward)
         count = sum(len(views) for views, _, _ in sets)
-        for views, scores, outputs in scored_views(network, sets, per_forward):
+        joins = getattr(self._loaded.network, "takes_all_views", False)
+        for views, scores, outputs in scored_views(network, sets, per_forward, joins):
             mosaic.add(scores, views)
             if "segments" in outputs and hasattr(mosaic, "add_segments"):
                 mosaic.add_segments(outputs["segments"], views)
@@ -305,6 +327,35 @@ class Predictor:
                 mosaic.facts["rotation_error_deg"] = outputs["rotation_error_deg"]
             progress(len(views) / count)
         return mosaic
+
+    def consistency(self, image: InputImage, number: int, rng: Any) -> dict[str, float]:
+        """Compare the predictions for a rotated panorama with that for the panorama itself.
+
+        The views are rotated, so that nothing but the views is resampled. That is a rotation of
+        the panorama by the inverse; all predictions have the orientation of the panorama.
+
+        Args:
+            image: The panorama.
+            number: Number n of rotations of each of `TURNS`. Turns are by multiples of 360° / (n +
+                1), rounded to whole columns of an equirectangular image, which are not resampled.
+            rng: Source of the random rotations, a `numpy.random.Generator`.
+
+        Returns:
+            Means over the rotations of the scores of `Head.agreement`, by name of the column.
+        """
+        columns = max(self._views.image_size(image)[1], 2 * self._views.image_size(image)[0])
+        angles = np.rint(np.arange(1, number + 1) * columns / (number + 1)) * 2 * np.pi / columns
+        turns = [t for a in angles for t in (rotation_about((0, 0, 1), a), random_rotation(rng))]
+        upright = np.eye(3) if image.up is None else upright_rotation(image.up)
+        rotated = (replace(image, up=r[:, 2], rotation=r) for r in upright @ np.array(turns))
+        images = (image, *rotated)
+        first, *others = (PredictedImage.fetch(i, self.predict(i).pixels(), {}) for i in images)
+        found = [self.head.agreement(first, other) for other in others]
+        return {
+            f"consistency_{name}_{turn}": float(np.mean([scores[name] for scores in found[k::2]]))
+            for k, turn in enumerate(TURNS)
+            for name in found[k]
+        }
 
 
 class UpLikelihood:

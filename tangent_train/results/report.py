@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tangent_train.errors import listed
+from tangent_train.console import print_text
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.metrics.scores import SOLID_ANGLE
 from tangent_train.results.chart import report_png
@@ -81,12 +79,11 @@ class Report:
         for name, mean in first.class_means.items():
             if not name.endswith(SOLID_ANGLE):
                 title = first.columns[mean].class_title
-                parts: dict[str, Part] = {c: c for c in first.class_names}
-                tables.append(self._parts(title[:1].upper() + title[1:], name, parts))
+                parts: dict[str, tuple[str, Part]] = {c: (name, c) for c in first.class_names}
+                tables.append(self._parts(title[:1].upper() + title[1:], parts))
         bands = next((row.bands for row in self.rows if row.bands), [])
-        titles: dict[str, Part] = {f"{band[0]:g}° … {band[1]:g}°": band for band in bands}
-        title = f"{first.columns[first.main].title} by latitude"
-        tables.append(self._parts(title, first.main, titles))
+        parts = {f"{band[0]:g}° … {band[1]:g}°": (first.main, band) for band in bands}
+        tables.append(self._parts(f"{first.columns[first.main].title} by latitude", parts))
         return [table for table in tables if table.rows]
 
     def _views(self) -> Table:
@@ -101,12 +98,12 @@ class Report:
         note = f"{self._legend} {_LEGEND_OF_INTERVALS}"
         return Table(title, ("", *conditions), cells if len(conditions) > 1 else [], note)
 
-    def _parts(self, title: str, name: str, parts: Mapping[str, Part]) -> Table:
-        """Return the table of a score of classes or latitude bands, given by title."""
+    def _parts(self, title: str, parts: Mapping[str, tuple[str, Part]]) -> Table:
+        """Return the table of scores of all images, classes or latitude bands, given by title."""
         rows = [
-            (row.label, *(self._cell(row, name, part) for part in parts.values()))
+            (row.label, *(self._cell(row, *part) for part in parts.values()))
             for row in self.rows
-            if any(row.score(name, part).folds for part in parts.values())
+            if any(row.score(*part).folds for part in parts.values())
         ]
         return Table(title, ("", *parts), rows)
 
@@ -132,41 +129,32 @@ class Report:
 
     def differences(self) -> Table:
         """Return the table of the differences from the first run; no rows without differences."""
-        found = [(row, row.difference) for row in self.rows if row.difference is not None]
-        columns = {
-            name: column
-            for name, column in self.first.columns.items()
-            if (column.is_main or column.of_sphere) and any(name in of.scores for _, of in found)
-        }
-        rows = []
-        for row, of in found:
-            count = row.results[0].images
-            images = f"{of.images} of {count}" if of.images < count else str(count)
-            cells = (_signed(of, name, column.unit) for name, column in columns.items())
-            rows.append((row.label, images, *cells))
-        header = ("", self.first.noun, *(column.title for column in columns.values()))
-        return Table(f"Difference from {self.base}", header, rows, _LEGEND_OF_DIFFERENCES)
+        found = {row.label: row.difference for row in self.rows if row.difference is not None}
+        rows = [(f"{self.first.noun} of both", *(str(of.images) for of in found.values()))]
+        for name, column in self.first.columns.items():
+            is_shown = column.is_main or column.of_sphere
+            if is_shown and any(name in of.scores for of in found.values()):
+                cells = (_signed(of, name, column.unit) for of in found.values())
+                rows.append((column.title, *cells))
+        title = f"Difference from {self.base}"
+        return Table(title, ("", *found), rows if found else [], _LEGEND_OF_DIFFERENCES)
 
-    def sphere(self, condition: str | None = None) -> Table:
-        """Return the table of the scores that only panoramas have; no rows without such scores.
+    def sphere(self) -> Table:
+        """Return the table of the scores that only panoramas have, in the first condition."""
+        first = next(iter(self.cells.values()), ("", ""))
+        rows = [row for row in self.rows if self.cells.get(row.label, first)[1] == first[1]]
+        columns = {name: c for name, c in self.first.columns.items() if c.of_sphere}
+        scored = [name for name in columns if any(row.score(name).folds for row in rows)]
+        parts = {columns[name].title: (name, None) for name in scored}
+        return replace(self, rows=rows)._parts(f"On the sphere {first[1]}".strip(), parts)
 
-        Args:
-            condition: Condition of the rows, of those that have one; None for all.
-        """
-        conditions = {label: cell[1] for label, cell in self.cells.items() if condition is not None}
-        rows = [row for row in self.rows if conditions.get(row.label, condition) == condition]
-        names = {
-            name: column.title
-            for name, column in self.first.columns.items()
-            if column.of_sphere and any(row.score(name).folds for row in rows)
-        }
-        cells = [
-            (row.label, *(self._cell(row, name) for name in names))
-            for row in rows
-            if any(row.score(name).folds for name in names)
-        ]
-        note = f"{self._legend} {_LEGEND_OF_INTERVALS}"
-        return Table("On the sphere", ("", *names.values()), cells, note)
+    def print(self) -> None:
+        """Print the first table, differences, the table of the sphere, and the notes."""
+        for table in (self.tables()[0], self.differences(), self.sphere()):
+            if table.rows:
+                table.print()
+        for note in self.notes:
+            print_text(f"- {note}")
 
     def _cell(self, row: RunRow, name: str, part: Part = None) -> str:
         """Return a score with its spreads, and "of 2" if it is over fewer folds than the row."""
@@ -246,9 +234,8 @@ def _change(ratio: float | None) -> str:
 
 def _signed(found: Difference, name: str, unit: str) -> str:
     """Return a difference with its sign and its interval."""
-    score = found.scores.get(name, math.nan)
-    text = score_text(None if math.isnan(score) else score, unit, found.intervals.get(name))
-    return "+" * (score > 0) + text
+    score, interval = found.scores.get(name), found.intervals.get(name)
+    return "+" * (score is not None and score > 0) + score_text(score, unit, interval)
 
 
 def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) -> Report:
@@ -270,18 +257,14 @@ def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) 
         if name not in ("data", "classes") and len({p.get(name) for p in protocols}) > 1
     ]
     rows, sources = _rows(group_results(results), shown)
-    base, reasons = rows[0], defaultdict(list)
+    base, missing = rows[0], []
     for place, row in enumerate(rows[1:], start=1):
         if len(row.results) == len(base.results) == 1:
             found = difference(row.results[0], base.results[0])
             if isinstance(found, Difference):
                 rows[place] = replace(row, difference=found)
             else:
-                reasons[found].append(row.label)
-    missing = [
-        f"{listed(labels)}: no difference from {base.label}: {reason}."
-        for reason, labels in reasons.items()
-    ]
+                missing.append(f"{row.label}: no difference from {base.label}: {found}.")
     rows.sort(
         key=lambda row: (
             row.facts["data"],
