@@ -28,7 +28,7 @@ _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "log_distance": "the logarithm of the distance in meters",
     "metric_distance": "the distance along each ray in meters",
     "metric_z": "z-depth in meters",
-    "canonical_z": "z-depth in meters of one camera, multiplied by the focal length of a view",
+    "canonical_z": "z-depth in meters of one camera; that of a view follows its focal length",
     "canonical_inverse": "1 / z-depth in meters, times the focal length of a view in widths",
     "relative_z": "z-depth up to a scale of each view",
     "relative_depth": "z-depth up to a scale and a shift of each view",

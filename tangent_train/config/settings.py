@@ -154,6 +154,11 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """depth: align the views with each other: none | scale | affine | grid (scales that vary within
     a view); null = by the kind of depth"""
 
+    align_across: Literal["frames"] | ExistingPath | None = None
+    """depth: bring all panoramas to one scale: frames (of a video, or of a folder in order, each
+    near the next) | their poses, in whose unit depth is then (the JSON file of tangent-render
+    poses=, or a folder of a sparse COLMAP model); null = each has its own"""
+
     # --- output ---
     output: Path
     """folder for the results"""
