@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.label_map import LabelMap, read_label_map
+from datamodules.core.label_map import PANOPTIC, PIXEL_CLASSES, LabelMap, read_label_map
 from tangent_train.callbacks.pictures import Pictures
 from tangent_train.cli.run import Run, build_data, build_head
 from tangent_train.config.settings import EvaluateSettings, refuse_typed
@@ -27,6 +27,7 @@ from tangent_train.heads.pictures import evenly_spread
 from tangent_train.io.gpano import read_area
 from tangent_train.io.image_files import composed, walk_files
 from tangent_train.io.pixel_files import read_depth_m, read_image_size
+from tangent_train.metrics.panoptic import LABEL
 from tangent_train.progress import show_progress
 from tangent_train.rendering.resampling import resize
 from tangent_train.results.tables import score_text
@@ -116,7 +117,7 @@ class Variants:
     """
 
     def __init__(self, head: Any, data: Any, count: int) -> None:
-        numberings = {} if data.has_distances else _numberings(data.num_classes)
+        numberings = {} if data.labels != PIXEL_CLASSES else _numberings(data.num_classes)
         self._head, self._changes = head, {_AS_THEY_ARE: torch.clone} | _MISTAKES | numberings
         self._metrics = {name: head.build_metric() for name in self._changes}
         self._compared = set(evenly_spread(_COMPARED, count))
@@ -215,7 +216,7 @@ class ScoredFiles:
     def _folder(self) -> Path:
         """Return the folder of the files: of an output folder of this project, a part of it."""
         given: Any = self._settings.predictions
-        kind = given / ("depth" if self._data.has_distances else "labels")
+        kind = given / self._head.source
         return kind if kind.is_dir() else given
 
     def _matched(self) -> tuple[dict[str, Path], list[Path]]:
@@ -304,6 +305,9 @@ class ScoredFiles:
                 raise DataError(path, found="an archive", expected="distances: .npy, EXR or PNG")
             depth = read_depth_m(path, settings.depth_scale, settings.depth_channel)
             return np.where(depth > 0, depth, np.float32(np.nan))
+        if self._data.labels == PANOPTIC:
+            labels, numbers = np.divmod(self._head.read(path), LABEL)
+            return label_map.decode(labels, path) * np.int32(LABEL) + numbers
         if path.suffix.lower() not in _ARRAYS:
             return label_map.read_labels(path)
         array = _array(path)

@@ -101,6 +101,13 @@ def scored_views(
             yield views[part], scores.float(), outputs
 
 
+def add_views(mosaic: Any, views: Any, scores: Tensor, outputs: Mapping[str, Any]) -> None:
+    """Add scores and objects of some views, see `scored_views`, to the mosaic of a head."""
+    mosaic.add(scores, views)
+    if "segments" in outputs and hasattr(mosaic, "add_segments"):
+        mosaic.add_segments(outputs["segments"], views)
+
+
 def upright_rays(
     sets: Iterable[Views], rotation: NDArray[np.float64] | None, device: torch.device | str
 ) -> Iterator[Tensor | None]:
@@ -298,9 +305,7 @@ class Predictor:
             network = partial(network, view_batch_size=per_forward)
         count = sum(len(views) for views, _, _ in sets)
         for views, scores, outputs in scored_views(network, sets, per_forward):
-            mosaic.add(scores, views)
-            if "segments" in outputs and hasattr(mosaic, "add_segments"):
-                mosaic.add_segments(outputs["segments"], views)
+            add_views(mosaic, views, scores, outputs)
             if "rotation_error_deg" in outputs:
                 mosaic.facts["rotation_error_deg"] = outputs["rotation_error_deg"]
             progress(len(views) / count)
