@@ -10,22 +10,28 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from torchmetrics.detection import PanopticQuality
 
-import tangent_train as tt
 from datamodules.stanford2d3ds.files import CLASSES, MISSING_LABEL, THINGS
-from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from tangent_train.errors import SettingError
 from tangent_train.io.pixel_files import write_pixels
+from tangent_train.metrics.collected import PanopticMetric
 from tangent_train.metrics.panoptic import LABEL
 from tangent_train.photo_networks import PhotoNetwork, import_network
-from tests.cli.test_predict_objects import NAMES, SETTINGS, SHAPE, TRUST, UNIT, Connected, scene
+from tests.cli.test_predict_objects import NAMES, SETTINGS, TRUST, UNIT, Connected, scene
 from tests.cli.tiny_runs import Run, results
 
 TABLE = ["<UNK>_0_<UNK>_0_0", *(f"{n}_{k}_office_1_5" for n in NAMES for k in range(9))]
 STARTS = {name: 1 + 9 * k for k, name in enumerate(NAMES)}
-DATA = ("task=panoptic", "data=stanford2d3ds", "data.root=data", "data.inputs=[rgb]", "+data.areas=[1,5a]", "panels=2")
-ERP_128 = ("level=6", "representation=tangent", "representation.base_level=0")
+DATA = (
+    "task=panoptic",
+    "data=stanford2d3ds",
+    "data.root=data",
+    "data.inputs=[rgb]",
+    "+data.areas=['1','5a']",
+)
+VIEWS = ("level=6", "representation=tangent", "representation.base_level=0")
+SCORES = ("pq", "sq", "rq")
 COMMON = ("label_map=map.json", f"trust=[{TRUST}]", "logger=none", "trainer.accelerator=cpu")
 
 
@@ -61,12 +67,6 @@ def truths(tmp_path: Path) -> list[NDArray[np.int64]]:
     return [codes, np.roll(other, 40, axis=1)]
 
 
-def in_classes(codes: Any) -> NDArray[np.int64]:
-    """Toy codes with the labels of the 13 classes, and 0 as the number of stuff."""
-    labels = np.array([0, *(1 + CLASSES.index(name) for name in NAMES)])[codes // LABEL]
-    return labels * LABEL + codes % LABEL
-
-
 def expected_scores(pairs: list[tuple[Any, Any]]) -> NDArray[np.float64]:
     """PQ, SQ and RQ of wall, chair and table, of torchmetrics."""
     wall, *things = (1 + CLASSES.index(name) for name in NAMES)
@@ -79,27 +79,106 @@ def expected_scores(pairs: list[tuple[Any, Any]]) -> NDArray[np.float64]:
     return found
 
 
-def test_scores_of_whole_panoramas_are_those_of_torchmetrics(
-    truths: list[NDArray[np.int64]], tmp_path: Path, run: Run
-) -> None:
-    run("evaluate", "checkpoint=net.ckpt", *DATA, *ERP_128, *COMMON, "hydra.run.dir=out")
-    content = results(tmp_path / "out")
-    views = {"option": "tangent", "base_level": 0}
-    loaded = tt.load("net.ckpt", label_map="map.json", levels=6, views=views, trust=TRUST)
-    shift = {"wall": 12, "chair": 5, "table": 11}
-    assert {name: 1 + CLASSES.index(name) for name in NAMES} == shift
-    files = sorted(Path("data/area_5a/pano/rgb").iterdir())
-    own = {label: 1 + CLASSES.index(name) for label, name in enumerate(loaded.class_names[1:], 1)}
-    table = np.array([0, *own.values()])
-    pairs = []
-    for file, truth in zip(files, truths, strict=True):
-        codes, _ = loaded.panoptic(file)
-        codes = np.where((codes // LABEL > 1) & (codes % LABEL == 0), 0, codes)
-        pairs.append((table[codes // LABEL] * LABEL + codes % LABEL, in_classes(truth)))
-    per_class = {e["class"]: [e[n] for n in ("pq", "sq", "rq")] for e in content["classes"]}
+@pytest.fixture
+def compared(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
+    """Predicted and true maps that the metric gets."""
+    pairs: list[tuple[Any, Any]] = []
+    update = PanopticMetric.update
+
+    def recorded(self: Any, prediction: Tensor, truth: Tensor) -> None:
+        pairs.append((prediction.numpy(), truth.numpy()))
+        update(self, prediction, truth)
+
+    monkeypatch.setattr(PanopticMetric, "update", recorded)
+    return pairs
+
+
+def check(folder: Path, pairs: list[tuple[Any, Any]], truths: list[NDArray[np.int64]]) -> Any:
+    """Compare the results in a folder with torchmetrics; return their scores."""
+    for (_, truth), codes in zip(pairs, truths, strict=True):
+        expected = codes.copy()
+        for label, name in enumerate(NAMES, 1):
+            of_class = codes // LABEL == label
+            number = (STARTS[name] + codes % LABEL) * (name in THINGS)
+            expected[of_class] = ((1 + CLASSES.index(name)) * LABEL + number)[of_class]
+        np.testing.assert_array_equal(truth, expected)
+    content = results(folder)
+    per_class = {e["class"]: [e[name] for name in SCORES] for e in content["classes"]}
     expected = expected_scores(pairs)
-    assert np.array([per_class[name] for name in NAMES]) == pytest.approx(expected, abs=1e-6)
-    means = [content["scores"][name] for name in ("pq", "sq", "rq")]
-    assert means == pytest.approx(expected.mean(axis=0), abs=1e-6)
-    assert 0.5 < means[0] < 0.95
-    print(content["scores"], content["intervals"], content["protocol"])
+    assert np.array([per_class[name] for name in NAMES]) == pytest.approx(expected)
+    scores = content["scores"]
+    assert [scores[name] for name in SCORES] == pytest.approx(expected.mean(axis=0))
+    assert scores["pq_things"] == pytest.approx(expected[1:, 0].mean())
+    assert content["intervals"].keys() >= {"pq", "rq_solid_angle", "pq_seam"}
+    return scores
+
+
+def test_scores_are_those_of_torchmetrics(
+    truths: list[NDArray[np.int64]], compared: list[Any], tmp_path: Path, run: Run
+) -> None:
+    run("evaluate", "checkpoint=net.ckpt", *DATA, *VIEWS, *COMMON, "panels=0", "hydra.run.dir=out")
+    scores = check(tmp_path / "out", compared, truths)
+    assert 0.5 < scores["pq"] < 0.9
+    # Chairs across the seam match; that at the pole is not in the second truth.
+    assert scores["pq_seam"] > 0.9
+    assert scores["pq_poles"] == pytest.approx(2 / 3, abs=0.01)
+    content = results(tmp_path / "out")
+    assert content["protocol"]["things"] == ", ".join(THINGS)
+    with np.load(tmp_path / "out" / "results.npz") as sums:
+        assert sums["things"].shape == (2, 2, 3, 9, 4)
+
+
+def test_a_perfect_network_and_its_files(
+    truths: list[NDArray[np.int64]], compared: list[Any], tmp_path: Path, run: Run
+) -> None:
+    """The first panorama is what its image shows; the bound is the sampling of the views."""
+    for file in (tmp_path / "data" / "area_5a" / "pano").glob(f"*/camera_{2:032x}*"):
+        file.unlink()
+    run("evaluate", "checkpoint=net.ckpt", *DATA, *VIEWS, *COMMON, "panels=1", "hydra.run.dir=out")
+    pairs = [compared[0]]  # the second one is for the picture
+    scores = check(tmp_path / "out", pairs, truths[:1])
+    assert scores["rq"] == scores["rq_solid_angle"] == 1
+    assert scores["pq"] > 0.97
+    assert min(scores["pq_seam"], scores["pq_poles"]) > 0.97
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "PQ of objects across ±180°" in report
+    assert len(list((tmp_path / "out" / "panels").iterdir())) == 1
+    run("report", "out")
+    assert "PQ" in (tmp_path / "out" / "report" / "report.md").read_text()
+
+
+def test_files_of_predictions(
+    truths: list[NDArray[np.int64]], compared: list[Any], tmp_path: Path, run: Run
+) -> None:
+    given = (
+        "checkpoint=net.ckpt",
+        "input=data/area_5a/pano/rgb",
+        "output=maps",
+        "write=[panoptic]",
+    )
+    run("predict", *given, *COMMON[:2])
+    run("evaluate", "predictions=maps", *DATA, "panels=0", "hydra.run.dir=out")
+    check(tmp_path / "out", compared[::-1][:2][::-1], truths)
+
+
+@pytest.mark.parametrize(
+    ("command", "changes", "message"),
+    [
+        ("train", ["data=synthrooms"], "task: found panoptic; expected task=segmentation: objects"),
+        (
+            "evaluate",
+            ["data=synthrooms_perspective"],
+            "data.labels: found panoptic; expected pixel_classes: the label files do not number",
+        ),
+        ("evaluate", ["data=stanford2d3ds"], "checkpoint: found a network without objects"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_refused(
+    command: str, changes: list[str], message: str, tmp_path: Path, run: Run
+) -> None:
+    photo = PhotoNetwork(Connected(), SETTINGS, NAMES, UNIT, (64, 64))
+    import_network(photo, tmp_path / "net.ckpt")
+    (tmp_path / "map.json").write_text(json.dumps({name: name for name in NAMES}))
+    typed = ["checkpoint=net.ckpt", *COMMON[:2], "data.inputs=[rgb]"] * (command == "evaluate")
+    with pytest.raises(SystemExit, match=message):
+        run(command, "task=panoptic", *typed, *changes)
