@@ -30,7 +30,8 @@ from benchmarks.measuring import DEVICE, FAILURES, Table, attempted
 from tangent_train.results.tables import Table as TextTable
 
 MEASURED = {
-    name: f"benchmarks.{name}" for name in ("start", "images", "labels", "area", "depth", "methods")
+    name: f"benchmarks.{name}"
+    for name in ("start", "images", "labels", "scores", "area", "depth", "methods")
 }
 MEASURED |= dict.fromkeys(("loader", "step", "evaluation"), "benchmarks.training")
 """Module of each benchmark; it has a function of the same name."""

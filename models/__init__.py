@@ -1,5 +1,6 @@
 """Networks. Other `nn.Module` classes that map images to scores can be named by ``_target_``."""
 
+from models.depth_anything_3 import DepthAnything3 as DepthAnything3
 from models.distortion_aware import make_distortion_aware as make_distortion_aware
 from models.fcn_resnet import FCNResNet as FCNResNet
 from models.harmonic_network import HarmonicNetwork as HarmonicNetwork

@@ -133,17 +133,21 @@ def load_tensors(
 
     Args:
         network: Network, changed in place.
-        tensors: Tensors by name.
+        tensors: Tensors by name; one of the names suffices for a tensor that several share.
         source: File of the tensors, for the message.
         fresh: Prefix of the names of tensors that are not loaded; None to load all.
 
     Raises:
         DataError: Tensors are missing, unexpected or of another shape.
     """
+    own = network.state_dict()
+    given = {own[name].data_ptr() for name in own.keys() & tensors.keys()}
     kept = {
         name: tensor
-        for name, tensor in network.state_dict().items()
-        if _COUNTER in name or (fresh is not None and name.startswith(fresh))
+        for name, tensor in own.items()
+        if _COUNTER in name
+        or (fresh is not None and name.startswith(fresh))
+        or (tensor.numel() and tensor.data_ptr() in given)
     }
     try:
         network.load_state_dict({**kept, **tensors})

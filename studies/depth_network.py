@@ -8,8 +8,9 @@ ZInD, whose layouts are known above the horizon: furniture is not in a layout.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,14 +24,16 @@ from studies.output import Row, save
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_latitudes
-from tangent_train.heads import head_of
-from tangent_train.heads.alignment import along_rays, depth_of_output, distance_of
-from tangent_train.inference.engine import Predictor, RenderedViews
+from tangent_train.geometry.camera import half_width
+from tangent_train.heads.alignment import AlignedMosaic
+from tangent_train.inference.engine import RenderedViews
 from tangent_train.inference.images import InputImage, read_panorama
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.pixel_files import read_depth_m, read_rgb
+from tangent_train.kinds import Align
 from tangent_train.metrics.depth import BANDS, DepthProtocol, depth_scores, error_sums
 from tangent_train.metrics.scores import BAND_EDGES_DEG
+from tangent_train.rendering.representations.views import PinholeViews, Views
 from tangent_train.rendering.resampling import resize
 
 _FARTHEST_M = 100.0
@@ -39,9 +42,17 @@ _FARTHEST_M = 100.0
 _SHAPE = 512, 1024
 """Rows and columns of all panoramas."""
 
-_MODES = "none", "scale", "grid"
+_MODES: tuple[Align, ...] = "none", "scale", "grid"
+_CAMERAS = "ignored", "used"
 _UNALIGNED = "equirectangular image", "six cube faces"
-"""Views without overlap, of which every mode is the same."""
+"""Views without overlap, of which all corrections are equal."""
+_WITH_GRID = (
+    "20 tangent images (b = 0)",
+    "16 horizontal views, 130° and 100°",
+    "18 horizontal views of 100°",
+    "views like the photos",
+)
+"""Views with the correction `grid`, which takes long, on rooms."""
 
 
 class Panorama(NamedTuple):
@@ -81,14 +92,13 @@ def homes(root: Path) -> Iterator[Panorama]:
         yield Panorama("ZInD", image, torch.from_numpy(distance).float())
 
 
-def view_options(loaded: LoadedNetwork, fov_deg: Sequence[float]) -> dict[str, dict[str, Any]]:
+def view_options(loaded: LoadedNetwork) -> dict[str, dict[str, Any]]:
     """Return the arguments of `ViewSelector` by the name of the views.
 
     Args:
         loaded: The network.
-        fov_deg: Horizontal and vertical field of view of the photos of its training.
     """
-    level, size = loaded.photo_level or loaded.level, list(loaded.fixed_size or loaded.image_size)
+    level, fov_deg = loaded.photo_level or loaded.level, loaded.photo_fov_deg or (90.0, 90.0)
     found: dict[str, dict[str, Any]] = {
         "equirectangular image": {"views": "erp"},
         "six cube faces": {"views": "cubemap"},
@@ -97,12 +107,12 @@ def view_options(loaded: LoadedNetwork, fov_deg: Sequence[float]) -> dict[str, d
         "16 horizontal views, 130° and 100°": {"views": "horizontal_wide"},
         "18 horizontal views of 100°": {"views": "horizontal"},
     }
-    own = {"option": "horizontal", "rings": None, "fov": list(fov_deg), "dim": size}
-    for overlap in (0.1, 0.25, 0.4):
-        views = own | {"square_pixels": False, "overlap": overlap}
-        found[f"own field of view, overlap {overlap:g}"] = {"views": views, "levels": level}
-    square = own | {"fov": [fov_deg[0]] * 2, "overlap": 0.25}
-    found[f"{fov_deg[0]:g}° × {fov_deg[0]:g}°"] = {"views": square, "levels": level}
+    found["views like the photos"] = {"views": "horizontal_camera"}
+    for across in (80.0, 100.0):  # stretched as the photos were
+        ratio = half_width(fov_deg[1]) / half_width(fov_deg[0])
+        down = 2 * math.degrees(math.atan(half_width(across) * ratio))
+        views = {"option": "horizontal_camera", "fov": [across, down]}
+        found[f"{across:g}° × {down:.0f}°, stretched"] = {"views": views}
     return found
 
 
@@ -124,71 +134,85 @@ def scores(prediction: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
 
 
 def measure(
-    loaded: LoadedNetwork, panoramas: Sequence[Panorama], options: Mapping[str, dict[str, Any]]
-) -> list[Row]:
-    """Return the scores of every panorama, with all views and corrections."""
-    rows: list[Row] = []
-    for name, given in options.items():
-        for mode in _MODES[:1] if name in _UNALIGNED else _MODES:
-            head = head_of(loaded, align=mode)
-            predictor = Predictor(loaded, head, ViewSelector(loaded, **given))
-            for number, (group, image, truth) in enumerate(panoramas):
-                mosaic = predictor.predict(image)
-                row: Row = {"data": group, "panorama": number, "views": name, "align": mode}
-                row |= scores(mosaic.pixels(), truth)
-                steps = {key: mosaic.facts[key] for key in ("step_before", "step_after")}
-                rows.append(row | {"number": mosaic.facts["views"]} | steps)
-    return rows
+    loaded: LoadedNetwork, panoramas: Sequence[Panorama], name: str, given: Mapping[str, Any]
+) -> tuple[list[Row], list[Row]]:
+    """Return the scores of every panorama, and the scale of every view.
 
-
-def scales_of_views(
-    loaded: LoadedNetwork, panoramas: Sequence[Panorama], options: Mapping[str, dict[str, Any]]
-) -> list[Row]:
-    """Return the median ratio of predicted and true distances in a view, by the view's pitch.
+    Args:
+        loaded: The network, whose camera is known.
+        panoramas: The panoramas.
+        name: Name of the views.
+        given: Arguments of `ViewSelector`.
 
     Returns:
-        For every option and pitch the mean and standard deviation over views and panoramas, of
-        views with a known distance in a quarter of their pixels.
+        Rows of scores for both uses of the camera and all corrections. Rows of views with a known
+        distance in a quarter of their pixels: the median ratio of the network's and the true
+        distances, the camera ignored.
     """
-    rows: list[Row] = []
-    for name, given in options.items():
-        ratios: dict[tuple[str, int], list[float]] = {}
-        selector = ViewSelector(loaded, **given)
-        for group, image, truth in panoramas:
-            ((source, shape, sets, _),) = selector(image)
-            rendered = RenderedViews(loaded, source, shape, "cpu")
-            for views in sets:
-                lengths = torch.from_numpy(views.ray_lengths())[:, None]
-                with torch.no_grad():
-                    output = loaded.network(rendered.of(views)(slice(None)))
-                depth, kind = depth_of_output(output, loaded.depth_kind or "metric_z", lengths)
-                distance = distance_of(along_rays(depth, kind, lengths), kind)[:, 0]
+    found: list[Row] = []
+    ratios: list[Row] = []
+    selector = ViewSelector(loaded, **given)
+    for group, image, truth in panoramas:
+        ((source, shape, sets, _),) = selector(image)
+        rendered = RenderedViews(loaded, source, shape, "cpu")
+        with torch.no_grad():
+            outputs = [loaded.network(rendered.of(views)(slice(None))) for views in sets]
+        outputs = [output / _span(loaded) for output in outputs]
+        for views, output in zip(sets, outputs, strict=True):
+            if isinstance(views, PinholeViews):
+                distances = output[:, 0] * torch.from_numpy(views.ray_lengths())
                 true = views.render(truth[None], "nearest")[:, 0]
-                heights = np.arcsin(views.rays()[:, 2, 2])
-                for height, d, g in zip(heights, distance, true, strict=True):
+                heights = np.degrees(np.arcsin(views.grid.centers_xyz[:, 2])).round()
+                for height, d, g in zip(heights, distances, true, strict=True):
                     known = g > 0
+                    row: Row = {"data": group, "views": name, "pitch °": int(height)}
                     if known.float().mean() > 0.25:
-                        ratio = float((d / g)[known].nanmedian())
-                        key = group, round(float(np.degrees(height)))
-                        ratios.setdefault(key, []).append(ratio)
-        for (group, height), found in sorted(ratios.items()):
-            mean, spread = float(np.mean(found)), float(np.std(found))
-            row = {"data": group, "views": name, "pitch °": height, "number": len(found)}
-            rows.append(row | {"scale": mean, "spread": spread})
+                        ratios.append(row | {"ratio": float((d / g)[known].median())})
+        modes = _MODES if name in _WITH_GRID and group == "rooms" else _MODES[:2]
+        for camera, mode in product((0, 1), modes[: 1 if name in _UNALIGNED else 3]):
+            mosaic = AlignedMosaic(image.shape, "metric_z", "feather", mode)
+            for views, output in zip(sets, outputs, strict=True):
+                mosaic.add(output * (_span(loaded) / _width(views) if camera else 1), views)
+            used = {"data": group, "views": name, "camera": _CAMERAS[camera], "align": mode}
+            row = used | scores(mosaic.pixels(), truth)
+            steps = {key: mosaic.facts[key] for key in ("step_before", "step_after")}
+            found.append(row | {"number": mosaic.facts["views"]} | steps)
+    return found, ratios
+
+
+def _span(loaded: LoadedNetwork) -> float:
+    """Return the width of the photos of the training at distance 1."""
+    return 2 * half_width((loaded.photo_fov_deg or (90.0, 90.0))[0])
+
+
+def _width(views: Views) -> float:
+    """Return the width of views at distance 1; the radians of an equirectangular image."""
+    return 2 * views.grid.half_size[0] if isinstance(views, PinholeViews) else 2 * math.pi
+
+
+def scales(ratios: Sequence[Row]) -> list[Row]:
+    """Return mean and standard deviation of the ratios of views of one pitch."""
+    rows: list[Row] = []
+    for key in sorted({tuple(row.values())[:3] for row in ratios}):
+        of_key = [row["ratio"] for row in ratios if tuple(row.values())[:3] == key]
+        row = dict(zip(("data", "views", "pitch °"), key, strict=True))
+        row |= {"number": len(of_key), "scale": float(np.mean(of_key))}
+        rows.append(row | {"spread": float(np.std(of_key))})
     return rows
 
 
 def means(rows: Sequence[Row], seed: int = 0) -> list[Row]:
     """Return means over panoramas, and 95 % bootstrap intervals of three scores."""
-    keys = list(dict.fromkeys((row["data"], row["views"], row["align"]) for row in rows))
+    keys = list(dict.fromkeys(tuple(row.values())[:4] for row in rows))
     rng, found = np.random.default_rng(seed), []
     for key in keys:
-        of_key = [row for row in rows if (row["data"], row["views"], row["align"]) == key]
+        of_key = [row for row in rows if tuple(row.values())[:4] == key]
         table: NDArray[np.float64] = np.array(
             [[np.nan if v is None else v for v in list(row.values())[4:]] for row in of_key], float
         )
         names = list(of_key[0])[4:]
-        row = {"data": key[0], "panoramas": len(of_key), "views": key[1], "align": key[2]}
+        row: Row = {"data": key[0], "panoramas": len(of_key)}
+        row |= dict(zip(("views", "camera", "align"), key[1:], strict=True))
         for name, values in zip(names, table.T, strict=True):
             known = values[~np.isnan(values)]
             row[name] = float(known.mean()) if len(known) else ""
@@ -208,14 +232,16 @@ def main() -> None:
     parser.add_argument("network", type=Path)
     parser.add_argument("--rooms", nargs="*", default=[], metavar="IMAGE=DISTANCES")
     parser.add_argument("--homes", type=Path)
-    parser.add_argument("--fov", nargs=2, type=float, default=(62.0, 48.0))
     given = parser.parse_args()
     loaded = load_network(given.network)
     panoramas = [*rooms(given.rooms), *(homes(given.homes) if given.homes else ())]
-    options = view_options(loaded, given.fov)
-    save("depth_network", means(measure(loaded, panoramas, options)), digits=3)
-    pinhole = {name: each for name, each in options.items() if "erp" not in each.values()}
-    save("depth_network_scales", scales_of_views(loaded, panoramas, pinhole), digits=3)
+    found: list[Row] = []
+    ratios: list[Row] = []
+    for name, options in view_options(loaded).items():
+        of_name = measure(loaded, panoramas, name, options)
+        found, ratios = found + of_name[0], ratios + of_name[1]
+    save("depth_network", means(found), digits=3)
+    save("depth_network_scales", scales(ratios), digits=3)
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ DepthKind = Literal[
     "log_distance",
     "metric_distance",
     "metric_z",
+    "canonical_z",
     "canonical_inverse",
     "relative_z",
     "relative_depth",
@@ -41,8 +42,11 @@ DepthKind = Literal[
   `DistanceHead`.
 * `metric_distance`: distance along the ray in meters.
 * `metric_z`: z-depth in meters, the distance times the cosine of the angle to the optical axis.
+* `canonical_z`: z-depth in meters of a camera whose focal length is the width of the image; z-depth
+  is proportional to the focal length. Also the output of a network of `metric_z` whose camera is
+  known, see `OutputNetwork`.
 * `canonical_inverse`: 1 / z-depth, in meters if the focal length were the width of the image, as of
-  Depth Pro; z-depth is proportional to the focal length.
+  Depth Pro.
 * `relative_z`: z-depth up to a scale per image.
 * `relative_depth`: z-depth up to a scale and a shift per image.
 * `relative_disparity`: 1 / z-depth up to a scale and a shift per image.

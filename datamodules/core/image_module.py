@@ -249,10 +249,14 @@ class ImageDataModule(DataModule):
                     f"median distance {median_m:.3g} m" if known.size else "no distance below 128 m"
                 )
                 warning = f"{files.depth}: {found}; check the units and the missing value."
-            labels = labels > 0
-        elif self.labels == PANOPTIC:
-            labels = labels // LABEL
-        return np.bincount(labels.ravel(), minlength=len(self.label_names)), warning
+        labels = self.counted_labels(labels).ravel()
+        return np.bincount(labels, minlength=len(self.label_names)), warning
+
+    def counted_labels(self, labels: Any) -> Any:
+        """Return the index in `label_names` of each pixel of labels, an array or a tensor."""
+        if self.has_distances:
+            return labels > 0
+        return labels // LABEL if self.labels == PANOPTIC else labels
 
     # --- samples -------------------------------------------------------------------------------
 

@@ -25,6 +25,7 @@ from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
 from tangent_train.files import checked_file, load_plain
+from tangent_train.geometry.camera import half_width
 from tangent_train.io.gpano import Fill
 from tangent_train.kinds import DepthKind, ScoreKind, depth_channels
 
@@ -67,6 +68,8 @@ class NetworkDescription:
             `is_spherical`.
         photo_level: Level s with the pixels per degree of the photos that an imported network was
             trained on; None for other networks.
+        photo_fov_deg: Horizontal and vertical field of view in degrees of these photos; None if
+            unknown. The z-depth of a network of `canonical_z` is right for this camera.
         groups: Indices of a photo network's scores for each class, and in a last group those of no
             class: where they win, the label is 0. None if each score is a class.
         things: Names of the classes of which the network returns objects, see `Segments`.
@@ -87,6 +90,7 @@ class NetworkDescription:
     size_multiple: Annotated[int, Field(ge=1)] = 1
     fixed_size: _Size | None = None
     photo_level: int | None = None
+    photo_fov_deg: tuple[float, float] | None = None
     groups: tuple[tuple[int, ...], ...] | None = None
     things: tuple[str, ...] = ()
     score_kind: ScoreKind = "logits"
@@ -164,7 +168,9 @@ class LoadedNetwork(NetworkDescription):
         tile = None if self.is_spherical else self.fixed_size
         if self.predicts == DISTANCE and self.depth_kind is not None:
             channels = depth_channels(self.depth_kind)
-            return OutputNetwork(self.module, channels, tile=tile, kind=None).eval()
+            known = self.photo_fov_deg if self.depth_kind == "canonical_z" else None
+            gain = 2 * half_width(known[0]) if known else 1.0
+            return OutputNetwork(self.module, channels, tile=tile, kind=None, gain=gain).eval()
         if self.predicts != PIXEL_CLASSES:
             return self.module
         count = len(self.class_names) - 1

@@ -40,10 +40,11 @@ class OutputNetwork(nn.Module):
     Args:
         network: Network that maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to label maps
             or depth, with or without an axis of channels, or to a dict with one of these under
-            ``"out"`` (as in torchvision). If its `forward` also takes ``world_from_camera`` and
-            ``camera_matrix`` ``(V, 3, 3)``, see `cameras_of_rays`, the images are all V views of a
-            panorama. A dict of a depth network may also contain ``"confidence"`` ``(B, h, w)`` and
-            its own ``"world_from_camera"``.
+            ``"out"`` (as in torchvision). If its `forward` also takes ``camera_matrix``
+            ``(B, 3, 3)``, it gets the matrix K of each view, see `cameras_of_rays`. If it takes
+            ``world_from_camera`` and ``camera_matrix`` ``(V, 3, 3)``, the images are all V views of
+            a panorama. A dict of a depth network may also contain ``"confidence"``
+            ``(B, h, w)`` and its own ``"world_from_camera"``.
         num_outputs: Number of channels of its output: K classes, or `depth_channels`.
         groups: Indices of the network's scores for each class, including index K of kinds that
             have it. Scores in no group, and classes without scores, never win. None if each score
@@ -52,11 +53,14 @@ class OutputNetwork(nn.Module):
             sizes. Larger images are divided for classes. For depth, images are resized: the parts
             of an image would have different scales.
         kind: Kind of the scores; None for depth.
+        gain: Number by which depth is multiplied: for z-depth in meters of one camera, the width of
+            its image at distance 1 makes it `canonical_z`.
 
     Attributes:
         num_outputs: Number of channels of the converted output, with `groups` their number.
         tile: See above.
-        takes_cameras: True if the network takes all views of a panorama with their cameras.
+        takes_cameras: True if the network takes views of a panorama with their cameras.
+        takes_all_views: True if it takes those of a panorama in one call.
     """
 
     def __init__(
@@ -66,13 +70,16 @@ class OutputNetwork(nn.Module):
         groups: Groups | None = None,
         tile: tuple[int, int] | None = None,
         kind: ScoreKind | None = "logits",
+        gain: float = 1.0,
     ) -> None:
         super().__init__()
         self.network = network
         self.num_outputs = num_outputs if groups is None else len(groups)
         self.tile = tile
-        self._groups, self._kind = groups, kind
-        self.takes_cameras = "world_from_camera" in signature(network.forward).parameters
+        self._groups, self._kind, self._gain = groups, kind, gain
+        named = signature(network.forward).parameters
+        self.takes_cameras = "camera_matrix" in named
+        self.takes_all_views = "world_from_camera" in named
 
     def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Any:
         """Return the converted output ``(B, num_outputs, h, w)``.
@@ -105,10 +112,17 @@ class OutputNetwork(nn.Module):
             if not arguments:
                 expected = "a panorama in tangent images, horizontal views or a cube map"
                 raise SettingError("views", found="views without cameras", expected=expected)
+            batch = settings.get("view_batch_size")
             arguments, settings = cameras_of_rays(arguments[0][0], tile), {}
         images = images if tile == size else _resized(images, tile)
-        returned = named_outputs(self.network(images, *arguments, **settings))
+        if self.takes_cameras and not self.takes_all_views:
+            given = (torch.split(each, batch or len(images)) for each in (images, arguments[1]))
+            parts = [named_outputs(self.network(*part)) for part in zip(*given, strict=True)]
+            returned = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+        else:
+            returned = dict(named_outputs(self.network(images, *arguments, **settings)))
         outputs = {n: _with_channels(returned[n]) for n in _MAPS if n in returned}
+        outputs["out"] = outputs["out"] * self._gain
         if tile != size:
             outputs = {name: _resized(values, size) for name, values in outputs.items()}
         if self.takes_cameras and "world_from_camera" in returned:

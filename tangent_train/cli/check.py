@@ -10,7 +10,8 @@ import numpy as np
 from datamodules.core.label_map import label_doubts
 from tangent_train.cli import main
 from tangent_train.cli.run import open_data
-from tangent_train.config.settings import RunSettings
+from tangent_train.cli.scored_files import check_files
+from tangent_train.config.settings import FilesSettings
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.geometry import equirect_solid_angles
@@ -18,8 +19,8 @@ from tangent_train.io.pixel_files import has_warned_of_range
 from tangent_train.results.tables import Table, percent
 
 
-def check(settings: RunSettings) -> None:
-    """Read the whole data set of a run; exit with status 1 if there are problems.
+def check(settings: FilesSettings) -> None:
+    """Read the whole data set of a run, or predictions; exit with 1 if there are problems.
 
     On a terminal, the problems are printed as a table. Elsewhere they are lines of file, finding
     and remedy, separated by tabs; everything else then goes to standard error.
@@ -27,6 +28,10 @@ def check(settings: RunSettings) -> None:
     Args:
         settings: Settings of the command.
     """
+    if settings.predictions is not None:
+        if not check_files(settings):
+            sys.exit(1)
+        return
     data = open_data(settings)
     terminal = sys.stdout.isatty()
     with redirect_stdout(sys.stderr):  # where progress is printed

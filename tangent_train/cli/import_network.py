@@ -28,6 +28,7 @@ _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "log_distance": "the logarithm of the distance in meters",
     "metric_distance": "the distance along each ray in meters",
     "metric_z": "z-depth in meters",
+    "canonical_z": "z-depth in meters of one camera, multiplied by the focal length of a view",
     "canonical_inverse": "1 / z-depth in meters, times the focal length of a view in widths",
     "relative_z": "z-depth up to a scale of each view",
     "relative_depth": "z-depth up to a scale and a shift of each view",
@@ -97,6 +98,16 @@ def _load(settings: ImportSettings) -> PhotoNetwork:
     return network
 
 
+def _camera(trained: LoadedNetwork) -> str:
+    """Description of the camera that a network is right for."""
+    if trained.photo_fov_deg is not None:
+        across, down = trained.photo_fov_deg
+        return f"{across:.4g}° × {down:.4g}°"
+    from tangent_train.photo_networks.importing import USUAL_FOV_DEG
+
+    return f"assumed {USUAL_FOV_DEG:g}° wide; fov=[horizontal,vertical] states another camera"
+
+
 def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) -> str:
     """Description of an imported network."""
     from tangent_train.inference.views import ViewSelector
@@ -119,6 +130,7 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
             f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
             f"normalization of images from 0 to 1: mean {mean}, std {std}",
             f"image size: {size}{multiple}",
+            f"photos of its training: {_camera(trained)}",
             f"panoramas: {ViewSelector(trained).description()}",
             *[trust] * bool(trained.trust),
         ]

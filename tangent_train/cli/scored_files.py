@@ -19,7 +19,7 @@ from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.label_map import PANOPTIC, PIXEL_CLASSES, LabelMap, read_label_map
 from tangent_train.callbacks.pictures import Pictures
 from tangent_train.cli.run import Run, build_data, build_head
-from tangent_train.config.settings import EvaluateSettings, refuse_typed
+from tangent_train.config.settings import EvaluateSettings, FilesSettings, refuse_typed
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted, listed, width_height
 from tangent_train.geometry.sphere import check_area
@@ -30,7 +30,7 @@ from tangent_train.io.pixel_files import read_depth_m, read_image_size
 from tangent_train.metrics.panoptic import LABEL
 from tangent_train.progress import show_progress
 from tangent_train.rendering.resampling import resize
-from tangent_train.results.tables import score_text
+from tangent_train.results.tables import Table, percent, score_text
 from tangent_train.threads import in_threads
 
 OF_FILES = ("values", "files", "resample", "depth_scale", "depth_channel")
@@ -68,36 +68,22 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     """
     predictions: Any = settings.predictions
     refuse_typed(_OF_NETWORKS, "nothing: predictions= is scored without a network")
-    rows = (settings.representation or {}).get("erp_height")
-    data = _data(settings, rows)
-    head = build_head(settings, data, "metric_distance" if data.has_distances else None)
-    scored = ScoredFiles(settings, data, head)
+    scored = ScoredFiles(settings)
+    data, head = scored.data, scored.head
     metric = head.build_metric()
     pictures = Pictures(folder / "panels", settings.panels)
     task = SimpleNamespace(network=None, head=head, representation=data.representation)
-    variants = Variants(head, data, len(scored.indices))
+    variants = Variants(scored)
 
-    def score() -> Iterator[None]:
-        for place, (index, found) in enumerate(in_threads(scored.read, scored.indices)):
-            if found is not None:
-                labels, prediction = map(torch.from_numpy, found)
-                truth = head.truth(labels)
-                comparable = head.comparable(prediction, truth)
-                metric.update(comparable, truth)
-                variants.update(place, prediction, truth)
-                pictures.draw(task, data.dataset("test"), index, None, labels, comparable)
-                scored.done.append(index)
-            yield
+    def score(place: int, labels: Tensor, prediction: Tensor) -> None:
+        truth = head.truth(labels)
+        comparable = head.comparable(prediction, truth)
+        metric.update(comparable, truth)
+        variants.update(place, prediction, truth)
+        index = scored.indices[place]
+        pictures.draw(task, data.dataset("test"), index, None, labels, comparable)
 
-    show_progress(score(), "Scoring", data.noun, len(scored.indices))
-    scored.print_problems()
-    if not scored.done:
-        raise DataError(
-            predictions,
-            found=f"no usable prediction for {counted(len(scored.items), data.noun)}",
-            expected=f"files named as the images, such as {scored.items[0].name}.png",
-            remedy="Or give files=, a CSV file with the columns image and prediction.",
-        )
+    scored.for_each(score, "Scoring")
     task.result, task.evaluated = metric.compute(), len(scored.done)
     if warning := variants.warning():
         print_text(f"Warning: {warning}", error=True)
@@ -107,20 +93,52 @@ def score_files(settings: EvaluateSettings, folder: Path) -> None:
     run.report(predictions, scored.done, [pictures])
 
 
+def check_files(settings: FilesSettings) -> bool:
+    """Print how predictions in files fit the test images; return True if nothing is wrong.
+
+    Args:
+        settings: Settings of the command.
+
+    Raises:
+        DataError: No prediction can be used.
+    """
+    scored = ScoredFiles(settings)
+    data, variants = scored.data, Variants(scored)
+    counts = np.zeros((2, len(data.label_names)), np.int64)
+
+    def count(place: int, labels: Tensor, prediction: Tensor) -> None:
+        variants.update(place, prediction, scored.head.truth(labels))
+        for row, pixels in enumerate((prediction, labels)):
+            shown = data.counted_labels(pixels).flatten()
+            counts[row] += np.bincount(shown.numpy(), minlength=counts.shape[1])
+
+    scored.for_each(count, "Checking")
+    missing, unusable, _ = problems = scored.problems
+    rows = [("usable predictions", str(len(scored.done)))]
+    rows += [(noun + what, str(len(names))) for noun, what, names in problems]
+    Table(f"Files for {counted(len(scored.items), data.noun)}", ("", "number"), rows).print()
+    shares = ([percent(share) for share in of / of.sum()] for of in counts)
+    classes = [*zip(data.label_names, *shares, strict=True)]
+    Table("Pixels, %", ("label", "predictions", "ground truth"), classes).print()
+    variants.table().print()
+    if warning := variants.warning():
+        print_text(f"Warning: {warning}")
+    return not (missing[2] or unusable[2] or warning)
+
+
 class Variants:
     """Scores of predictions as they are, and without each of the usual mistakes.
 
     Args:
-        head: Head that scores the predictions.
-        data: Data module.
-        count: Number of predictions, of which a few are compared.
+        scored: Files, of which a few are compared.
     """
 
-    def __init__(self, head: Any, data: Any, count: int) -> None:
+    def __init__(self, scored: ScoredFiles) -> None:
+        head, data = scored.head, scored.data
         numberings = {} if data.labels != PIXEL_CLASSES else _numberings(data.num_classes)
         self._head, self._changes = head, {_AS_THEY_ARE: torch.clone} | _MISTAKES | numberings
         self._metrics = {name: head.build_metric() for name in self._changes}
-        self._compared = set(evenly_spread(_COMPARED, count))
+        self._compared = set(evenly_spread(_COMPARED, len(scored.indices)))
         self.images = counted(len(self._compared), data.noun)
 
     def update(self, place: int, prediction: Tensor, truth: Tensor) -> None:
@@ -133,6 +151,14 @@ class Variants:
         of_metrics = {name: metric.compute() for name, metric in self._metrics.items()}
         main = self._head.main_score
         return {name: self._head.scores(of).means[main] for name, of in of_metrics.items()}
+
+    def table(self) -> Table:
+        """Return the table of the scores."""
+        column = self._head.columns[self._head.main_score]
+        rows = [(name, score_text(score, column.unit)) for name, score in self.scores().items()]
+        return Table(
+            f"With usual mistakes undone, on {self.images}", ("predictions", column.title), rows
+        )
 
     def warning(self) -> str:
         """Return a warning if a variant is better by a margin; else ""."""
@@ -154,7 +180,7 @@ def _numberings(num_classes: int) -> dict[str, Callable[[Tensor], Tensor]]:
     }
 
 
-def _data(settings: EvaluateSettings, rows: int | None) -> Any:
+def _data(settings: FilesSettings, rows: int | None) -> Any:
     """Build the data module; without a number of rows its panoramas have those of the first."""
     views = {"_target_": "tangent_train.rendering.EquirectRepresentation", "level": 0}
     section = views | {"erp_height": rows or 2}
@@ -175,13 +201,17 @@ class ScoredFiles:
     """Files with predictions, matched with the test images of a data set.
 
     Attributes:
+        data: Data module.
+        head: Head that scores the predictions.
         items: Files of all test images.
         indices: Places of the images that have a prediction.
         done: Places of the images that were scored.
     """
 
-    def __init__(self, settings: EvaluateSettings, data: Any, head: Any) -> None:
-        self._settings, self._data, self._head = settings, data, head
+    def __init__(self, settings: FilesSettings) -> None:
+        self.data = data = _data(settings, (settings.representation or {}).get("erp_height"))
+        self.head = build_head(settings, data, "metric_distance" if data.has_distances else None)
+        self._settings = settings
         self.items = data.splits()["test"]
         self._paths, self._extra = self._matched()
         self.indices = [k for k, files in enumerate(self.items) if files.name in self._paths]
@@ -200,23 +230,52 @@ class ScoredFiles:
             facts["resampled"] = f"{self._settings.resample}, from {sizes}"
         return facts
 
-    def print_problems(self) -> None:
-        """Print what was not scored."""
-        missing = [files.name for files in self.items if files.name not in self._paths]
-        for noun, what, names in (
-            ("images", " without a prediction", missing),
-            ("files", " of no test image", [str(path) for path in self._extra]),
-            ("unusable predictions", "", [str(error) for error in self._problems]),
-        ):
+    def for_each(self, use: Callable[[int, Tensor, Tensor], None], description: str) -> None:
+        """Read all predictions; print what cannot be used.
+
+        Args:
+            use: Function of the place in `indices`, the labels and the prediction.
+            description: Description of the work.
+
+        Raises:
+            DataError: No prediction can be used.
+        """
+
+        def used() -> Iterator[None]:
+            for place, (index, found) in enumerate(in_threads(self.read, self.indices)):
+                if found is not None:
+                    use(place, *map(torch.from_numpy, found))
+                    self.done.append(index)
+                yield
+
+        show_progress(used(), description, self.data.noun, len(self.indices))
+        for noun, what, names in self.problems:
             if names:
                 lines = "".join(f"\n  {name}" for name in names[:_NAMED])
                 more = f"\n  … {len(names) - _NAMED} more" * (len(names) > _NAMED)
                 print_text(f"{counted(len(names), noun)}{what}:{lines}{more}", error=True)
+        if not self.done:
+            raise DataError(
+                self._settings.predictions or "",
+                found=f"no usable prediction for {counted(len(self.items), self.data.noun)}",
+                expected=f"files named as the images, such as {self.items[0].name}.png",
+                remedy="Or give files=, a CSV file with the columns image and prediction.",
+            )
+
+    @property
+    def problems(self) -> list[tuple[str, str, list[str]]]:
+        """Names of missing, unusable and extra files, after their kind and where it differs."""
+        missing = [files.name for files in self.items if files.name not in self._paths]
+        return [
+            ("images", " without a prediction", missing),
+            ("unusable predictions", "", [str(error) for error in self._problems]),
+            ("files", " of no test image", [str(path) for path in self._extra]),
+        ]
 
     def _folder(self) -> Path:
         """Return the folder of the files: of an output folder of this project, a part of it."""
         given: Any = self._settings.predictions
-        kind = given / self._head.source
+        kind = given / self.head.source
         return kind if kind.is_dir() else given
 
     def _matched(self) -> tuple[dict[str, Path], list[Path]]:
@@ -248,7 +307,7 @@ class ScoredFiles:
 
     def _label_map(self) -> LabelMap:
         """Return the labels of the values in the files."""
-        data, values = self._data, self._settings.values
+        data, values = self.data, self._settings.values
         own: Any = self._settings.predictions
         if values is None and (own / "classes.json").is_file():
             values = own / "classes.json"
@@ -272,10 +331,10 @@ class ScoredFiles:
 
     def read(self, index: int) -> tuple[int, tuple[NDArray[Any], NDArray[Any]] | None]:
         """Return the place of an image, its labels and its prediction; None if it is unusable."""
-        source = self._data.dataset("test")
+        source = self.data.dataset("test")
         try:
             prediction = self._placed(self._paths[self.items[index].name])
-            is_whole = self._data.canvas.is_whole
+            is_whole = self.data.canvas.is_whole
             truth = source.labels(index) if is_whole else source.read(index).labels
         except DataError as error:
             self._problems.append(error)
@@ -285,7 +344,7 @@ class ScoredFiles:
 
     def _placed(self, path: Path) -> NDArray[Any]:
         """Return a prediction for the whole sphere, at the size of the labels."""
-        prediction, how, canvas = self._read(path), self._settings.resample, self._data.canvas
+        prediction, how, canvas = self._read(path), self._settings.resample, self.data.canvas
         if prediction.shape not in (canvas.full_shape, canvas.image_shape):
             size = width_height(prediction.shape)
             if how is None:
@@ -305,8 +364,8 @@ class ScoredFiles:
                 raise DataError(path, found="an archive", expected="distances: .npy, EXR or PNG")
             depth = read_depth_m(path, settings.depth_scale, settings.depth_channel)
             return np.where(depth > 0, depth, np.float32(np.nan))
-        if self._data.labels == PANOPTIC:
-            labels, numbers = np.divmod(self._head.read(path), LABEL)
+        if self.data.labels == PANOPTIC:
+            labels, numbers = np.divmod(self.head.read(path), LABEL)
             return label_map.decode(labels, path) * np.int32(LABEL) + numbers
         if path.suffix.lower() not in _ARRAYS:
             return label_map.read_labels(path)

@@ -129,9 +129,9 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 
     # --- views ---
     views: Views = None
-    """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy | erp |
-    erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null = those of
-    the checkpoint"""
+    """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy |
+    horizontal_camera | erp | erp_distortion_aware | cubemap, or 'views={option: horizontal, fov:
+    110}'; null = those of the checkpoint"""
     levels: OneOrMore[Level] | None = None
     """level s, or several levels of tangent images to average over; null = as in the checkpoint"""
     base_level: int | None = None
@@ -314,9 +314,9 @@ class ImportSettings(Settings):
     scores: ScoreKind | None = None
     """output of the network: logits | probabilities | labels; null = recognized from its values"""
     depth: DepthKind | None = None
-    """kind of depth that the network predicts: metric_z | metric_distance | relative_z |
-    relative_depth | relative_disparity | relative_points | canonical_inverse | log_distance; null =
-    from the model (huggingface), else it predicts classes"""
+    """kind of depth that the network predicts: metric_z | metric_distance | canonical_z |
+    canonical_inverse | relative_z | relative_depth | relative_disparity | relative_points |
+    log_distance; null = from the model (huggingface), else it predicts classes"""
     image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
     """fixed image size: [rows,columns] or the side; null = from the model"""
 
@@ -332,13 +332,14 @@ class ImportSettings(Settings):
     # --- photos and views ---
     normalization: str | dict[str, tuple[float, ...]] | None = None
     """imagenet | unit | symmetric | {mean: […], std: […]}; null = from the model"""
-    fov: FieldOfView = 60
-    """horizontal field of view in degrees of the photos it was trained on, for predictions on
+    fov: FieldOfView | tuple[FieldOfView, FieldOfView] | None = None
+    """field of view in degrees of the photos it was trained on, or [horizontal, vertical]; with it,
+    the depth of metric_z networks follows the focal length of a view; null = 60 for predictions on
     photos"""
     views: Views = None
-    """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |
-    erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null =
-    horizontal_wide; with levels= or base_level=, tangent"""
+    """views of panoramas: horizontal_wide | horizontal | horizontal_economy | horizontal_camera |
+    tangent | erp | erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null
+    = horizontal_wide; with levels= or base_level=, tangent"""
     levels: OneOrMore[Level] | None = None
     """level s, or several levels of tangent images; null = from the image size, two for tangent
     images, e.g. [9, 8]"""
@@ -478,22 +479,8 @@ class TrainSettings(RunSettings):
     """your own packages whose classes a checkpoint may use, e.g. my_networks"""
 
 
-class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
-    """Settings of tangent-evaluate."""
-
-    not_read: ClassVar[Sequence[str]] = (
-        *("network", "optimizer", "scheduler", "callbacks", "recipe", "ema"),
-        *("checkpoint_every_n_steps", "validation_images", "data.color_jitter"),
-        "representation.(faces_per_panorama|mirror|random_rotation)",
-        "task.(auxiliary_weight|backbone_lr_factor|frozen|view_batch_size)",
-        "task.head.(class_weights|label_smoothing|loss|scale_invariance)",
-        "trainer.(accumulate|check|gradient|limit_(train|val)|log|max|min|num_sanity)_.*",
-        "trainer.(overfit|reload|sync|val)_.*",
-    )
-
-    checkpoint: ExistingPath | None = None  # type: ignore[assignment]
-    """network file, written by tangent-train, tangent-import or tangent-export; required without
-    predictions="""
+class FilesSettings(RunSettings):
+    """Settings of commands that read predictions of any program."""
 
     # --- predictions of any program ---
     predictions: ExistingPath | None = None
@@ -513,6 +500,24 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     """predictions: units per meter in depth files of integers"""
     depth_channel: str | None = None
     """predictions: channel of OpenEXR files; null = as tangent-predict"""
+
+
+class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
+    """Settings of tangent-evaluate."""
+
+    not_read: ClassVar[Sequence[str]] = (
+        *("network", "optimizer", "scheduler", "callbacks", "recipe", "ema"),
+        *("checkpoint_every_n_steps", "validation_images", "data.color_jitter"),
+        "representation.(faces_per_panorama|mirror|random_rotation)",
+        "task.(auxiliary_weight|backbone_lr_factor|frozen|view_batch_size)",
+        "task.head.(class_weights|label_smoothing|loss|scale_invariance)",
+        "trainer.(accumulate|check|gradient|limit_(train|val)|log|max|min|num_sanity)_.*",
+        "trainer.(overfit|reload|sync|val)_.*",
+    )
+
+    checkpoint: ExistingPath | None = None  # type: ignore[assignment]
+    """network file, written by tangent-train, tangent-import or tangent-export; required without
+    predictions="""
 
     # --- views ---
     representation: Section | None = None  # type: ignore[assignment]
@@ -609,7 +614,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
     "prepare": PrepareSettings,
-    "check": RunSettings,
+    "check": FilesSettings,
 }
 """Settings by the name of the command."""
 

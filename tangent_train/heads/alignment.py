@@ -101,14 +101,14 @@ def is_metric(kind: DepthKind) -> bool:
 def depth_of_output(
     output: Tensor, kind: DepthKind, ray_lengths: Tensor
 ) -> tuple[Tensor, DepthKind]:
-    """Convert `log_distance` and `canonical_inverse` to meters, and points to z-depth.
+    """Convert `log_distance` and canonical depth to meters, and points to z-depth.
 
     Other kinds are returned unchanged.
 
-    The canonical inverse depth C is divided by the focal length in image widths (Bochkovskii et al.
-    2024, section 3.2). That follows from the rays: at columns of distance d, the second difference
-    of 1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as
-    in the authors' code.
+    Canonical depth is multiplied by the focal length in image widths (Yin et al. 2023), its inverse
+    divided by it (Bochkovskii et al. 2024, section 3.2). That follows from the rays: at columns of
+    distance d, the second difference of 1 + x² is 2 (d p)², with the pitch p of pixels on the image
+    plane. From the inverse, depth is at most 10 km, as in the authors' code.
 
     A point at distance ρ from the optical axis has the z-depth z + t with ρ = q (z + t), where q =
     √(x² + y²) is known at its pixel (x, y) on the image plane at distance 1. The shift t of an
@@ -124,6 +124,8 @@ def depth_of_output(
     """
     if kind == "log_distance":
         return output.exp(), "metric_distance"
+    if kind == "canonical_z":
+        return output / _span(ray_lengths), "metric_z"
     if kind == "canonical_inverse":
         inverse = output.where(output.isfinite(), torch.nan) * _span(ray_lengths)
         return 1 / inverse.clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
@@ -182,6 +184,8 @@ def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Ten
         raise SettingError("depth_kind", found=kind, expected=expected)
     if kind == "log_distance":
         return distance.log()
+    if kind == "canonical_z":
+        return distance / ray_lengths * _span(ray_lengths)
     if kind == "canonical_inverse":
         return ray_lengths / (distance * _span(ray_lengths))
     values = 1 / distance if is_disparity(kind) else distance

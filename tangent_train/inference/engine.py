@@ -22,7 +22,11 @@ from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import STEPS_PER_M, resize_depth
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
 from models.distortion_aware import make_ordinary
-from tangent_train.checkpoints.outputs import OutputNetwork, named_outputs, network_for_views
+from tangent_train.checkpoints.outputs import (
+    OutputNetwork,
+    named_outputs,
+    network_for_views,
+)
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid
 from tangent_train.geometry.sphere import equirect_elevations
@@ -59,11 +63,10 @@ _LEAST = 1e-4
 
 
 def sees_rays(network: nn.Module) -> bool:
-    """Return True if a network takes all views with their rays or cameras in one call."""
-    is_converted = isinstance(network, OutputNetwork)
-    inner: Any = network.network if is_converted else network
-    takes_cameras = is_converted and network.takes_cameras
-    return bool(takes_cameras) or "rays" in inspect.signature(inner.forward).parameters
+    """Return True if a network takes viewing rays or cameras, e.g. for cross-image attention."""
+    inner: Any = network.network if isinstance(network, OutputNetwork) else network
+    takes_cameras = bool(getattr(network, "takes_cameras", False))
+    return takes_cameras or "rays" in inspect.signature(inner.forward).parameters
 
 
 def views_per_forward(image_size: tuple[int, int]) -> int:
@@ -73,32 +76,48 @@ def views_per_forward(image_size: tuple[int, int]) -> int:
 
 @torch.no_grad()
 def scored_views(
-    network: Callable[..., Any], sets: Iterable[ViewSet], per_forward: int
+    network: Callable[..., Any], sets: Iterable[ViewSet], per_forward: int, joins: bool = False
 ) -> Iterator[tuple[Any, Tensor, Mapping[str, Tensor]]]:
     """Yield views of one image with their scores, a few at a time.
 
     Args:
         network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict that contains
             them under ``"out"``, and for depth optionally ``"confidence"`` ``(n, 1, h, w)``. A
-            network that takes rays or cameras is called once for a set with rays, with all views:
+            network that takes rays is called once for a set with rays, with all views:
             ``network(images, rays[None])``.
         sets: Sets of views.
         per_forward: Number of views per call of the network.
+        joins: True to call the network once for all sets, see `OutputNetwork`.
 
     Yields:
         Views; their float32 scores ``(n, K, h, w)``, with the confidence as the last channel; and
         all outputs of the network by name.
     """
+    if joins:
+        given = list(sets)
+        whole = torch.cat([read(slice(0, len(views))) for views, read, _ in given])
+        known = [of for _, _, of in given if of is not None]
+        returned = network(whole, torch.cat(known)[None]) if known else network(whole)
+        scores, outputs = _with_confidence(returned)
+        starts = np.cumsum([0, *(len(views) for views, _, _ in given)])
+        for (views, _, _), start in zip(given, starts, strict=False):
+            yield views, scores[start : start + len(views)], outputs
+        return
     for views, images, rays in sets:
         step = per_forward if rays is None else len(views)
         for start in range(0, len(views), step):
             part = slice(start, min(start + step, len(views)))
             returned = network(images(part), *(() if rays is None else (rays[None],)))
-            outputs = named_outputs(returned)
-            scores = outputs["out"]
-            if "confidence" in outputs:
-                scores = torch.cat([scores, outputs["confidence"]], dim=1)
-            yield views[part], scores.float(), outputs
+            yield views[part], *_with_confidence(returned)
+
+
+def _with_confidence(returned: Any) -> tuple[Tensor, Mapping[str, Tensor]]:
+    """Return float32 scores, with a confidence as the last channel, and all outputs by name."""
+    outputs = named_outputs(returned)
+    scores = outputs["out"]
+    if "confidence" in outputs:
+        scores = torch.cat([scores, outputs["confidence"]], dim=1)
+    return scores.float(), outputs
 
 
 def add_views(mosaic: Any, views: Any, scores: Tensor, outputs: Mapping[str, Any]) -> None:
@@ -304,7 +323,8 @@ class Predictor:
         if self._sees_rays:
             network = partial(network, view_batch_size=per_forward)
         count = sum(len(views) for views, _, _ in sets)
-        for views, scores, outputs in scored_views(network, sets, per_forward):
+        joins = getattr(self._loaded.network, "takes_all_views", False)
+        for views, scores, outputs in scored_views(network, sets, per_forward, joins):
             add_views(mosaic, views, scores, outputs)
             if "rotation_error_deg" in outputs:
                 mosaic.facts["rotation_error_deg"] = outputs["rotation_error_deg"]

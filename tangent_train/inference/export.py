@@ -124,7 +124,7 @@ def _write_onnx(
     returns_labels = loaded.score_kind == "labels"
     with hide_output():
         program: Any = torch.onnx.export(
-            loaded.module if returns_labels else loaded.network,
+            loaded.module if returns_labels else replace(loaded, photo_fov_deg=None).network,
             (_random_images(loaded, 2, size),),
             dynamo=True,
             input_names=["images"],

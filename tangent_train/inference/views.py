@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
@@ -51,6 +52,9 @@ _NOT_VIEWS = "icosphere", "perspective"
 
 _VIEWS = "horizontal_wide"
 """Views of panoramas for imported photo networks, see docs/results/real_panoramas.md."""
+
+_CAMERA = "horizontal_camera"
+"""Views of panoramas like the photos of a network's training."""
 
 _BASE_LEVEL = 1
 """For networks trained on photos (paper, section 5: transfer uses b = 1)."""
@@ -252,7 +256,11 @@ def view_settings(views: str | Mapping[str, Any]) -> dict[str, Any]:
 
 
 def photo_network_settings(
-    side: int, levels: Levels = None, base_level: int | None = None, views: ViewChoice = None
+    side: int,
+    levels: Levels = None,
+    base_level: int | None = None,
+    views: ViewChoice = None,
+    camera: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the settings of the representation of panoramas for an imported photo network.
 
@@ -263,14 +271,20 @@ def photo_network_settings(
         base_level: Base level b of tangent images; None for the fewest images.
         views: See `ViewChoice`; None for `horizontal_wide`, or tangent images if levels or base
             level are given.
+        camera: Settings of `horizontal_camera`, see `camera_settings`.
 
     Raises:
         SettingError: There are no such views.
     """
     is_default = levels is None and base_level is None
-    settings = view_settings(views or (_VIEWS if is_default else "tangent"))
+    views = views or (_VIEWS if is_default else "tangent")
+    changes = {"option": views} if isinstance(views, str) else views
+    is_camera = changes.get("option") == _CAMERA
+    settings = view_settings({**camera, **changes} if is_camera else views)
     is_tangent = settings["_target_"] == _TANGENT
     usual = wide_levels(side)[: 2 if is_tangent else 1]
+    if is_camera and camera:
+        usual = [camera["level"]]
     chosen = usual if levels is None else level_list(levels, 0)
     settings["level"] = max(chosen)
     if not is_tangent:
@@ -280,6 +294,19 @@ def photo_network_settings(
     if settings["dim"] is None and settings["crop_multiple"] is None:
         settings |= images_of_side(side, settings["level"], base_level)
     return settings | {"levels": chosen}
+
+
+def camera_settings(
+    fov_deg: tuple[float, float] | None, size: tuple[int, int], level: int | None
+) -> dict[str, Any]:
+    """Return the settings of `horizontal_camera` for a network's photos; none if they are unknown.
+
+    Args:
+        fov_deg: Horizontal and vertical field of view of the photos.
+        size: Rows and columns of the photos.
+        level: Level s with their pixels per degree.
+    """
+    return {} if fov_deg is None else {"fov": list(fov_deg), "dim": list(size), "level": level}
 
 
 def _only_of_tangent_images(levels: Sequence[int], base_level: int | None) -> dict[str, Any]:
@@ -307,7 +334,9 @@ def panorama_settings(
     """
     side, settings = loaded.photo_side, dict(loaded.representation)
     if side is not None and views is not None:
-        return photo_network_settings(side, levels, base_level, views)
+        size = loaded.fixed_size or (side, side)
+        camera = camera_settings(loaded.photo_fov_deg, size, loaded.photo_level)
+        return photo_network_settings(side, levels, base_level, views, camera)
     chosen = level_list(levels, loaded.level)
     level, was_tangent = max(chosen), settings["_target_"] == _TANGENT
     if views is not None:

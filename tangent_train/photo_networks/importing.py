@@ -32,9 +32,11 @@ from tangent_train.config.from_file import classes_to_trust
 from tangent_train.errors import SettingError, first_line, width_height
 from tangent_train.files import atomic_path
 from tangent_train.geometry import camera_matrix_from_fov, vertex_resolution
+from tangent_train.geometry.camera import half_width
 from tangent_train.inference.views import (
     Levels,
     ViewChoice,
+    camera_settings,
     check_size,
     photo_network_settings,
 )
@@ -43,6 +45,9 @@ from tangent_train.kinds import ScoreKind, depth_channels
 from tangent_train.photo_networks.network import PhotoNetwork
 
 _PHOTO_LEVELS = (5, 13)
+
+USUAL_FOV_DEG = 60.0
+"""Horizontal field of view of photos if it is unknown."""
 
 _MASK_NAMES = 2
 """Largest number of names for a single score: the class, or its background and the class."""
@@ -55,7 +60,7 @@ def import_network(
     network: PhotoNetwork,
     path: Path,
     *,
-    fov_deg: float = 60.0,
+    fov_deg: float | tuple[float, float] | None = None,
     levels: Levels = None,
     base_level: int | None = None,
     views: ViewChoice = None,
@@ -69,7 +74,9 @@ def import_network(
     Args:
         network: The network; it is set to evaluation mode.
         path: File to write: ``.ckpt``, or ``.onnx`` for a network from an ONNX file.
-        fov_deg: Horizontal field of view of the photos it was trained on, for labels of photos.
+        fov_deg: Horizontal field of view of the photos it was trained on, or horizontal and
+            vertical of photos that were stretched. None for `USUAL_FOV_DEG` in predictions on
+            photos. If given, metric z-depth is taken for right for this camera only.
         levels: See `photo_network_settings`.
         base_level: See `photo_network_settings`.
         views: See `photo_network_settings`.
@@ -98,12 +105,19 @@ def import_network(
         names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
         things = tuple(name for name in map(composed, network.things) if name in names)
         described = {"class_names": names, "groups": groups, "score_kind": kind, "things": things}
+    camera = None if fov_deg is None else _both_fov_deg(fov_deg, size)
+    depth_kind = network.depth_kind
+    if depth_kind == "metric_z" and camera is not None:
+        depth_kind = "canonical_z"
     # A network of a fixed size gets square images of its longer side, see `NetworkDescription`.
-    seen = photo_network_settings(max(size) if fixed else min(size), levels, base_level, views)
+    side = max(size) if fixed else min(size)
+    photo_level = _photo_level(size[1], camera[0] if camera else USUAL_FOV_DEG)
+    of_camera = camera_settings(camera, size, photo_level)
+    seen = photo_network_settings(side, levels, base_level, views, of_camera)
     loaded = LoadedNetwork(
         module=network.module,
         **described,
-        depth_kind=network.depth_kind,
+        depth_kind=depth_kind,
         inputs=("rgb",),
         normalization=network.normalization,
         level=seen["level"],
@@ -111,7 +125,8 @@ def import_network(
         image_size=build_from_config(seen, "representation").image_size,
         size_multiple=multiple,
         fixed_size=fixed,
-        photo_level=_photo_level(size[1], fov_deg),
+        photo_level=photo_level,
+        photo_fov_deg=camera,
         settings=network.settings,
     )
     check_size(loaded, loaded.image_size)
@@ -167,6 +182,15 @@ def usual_kind(output: Tensor, named: int) -> ScoreKind:
     is_share = bool((output >= 0).all() and (output <= 1).all())
     has_unit_sums = bool(((output.sum(dim=1) - 1).abs() < _ROUNDED).all())
     return "probabilities" if is_share and (has_unit_sums or output.shape[1] == 1) else "logits"
+
+
+def _both_fov_deg(
+    fov_deg: float | tuple[float, float], size: tuple[int, int]
+) -> tuple[float, float]:
+    """Return a horizontal and vertical field of view; one number is that of square pixels."""
+    if isinstance(fov_deg, tuple):
+        return fov_deg
+    return fov_deg, 2 * math.degrees(math.atan(half_width(fov_deg) * size[0] / size[1]))
 
 
 def _photo_level(columns: int, fov_deg: float) -> int:

@@ -19,7 +19,7 @@ class Difference:
 
     Attributes:
         images: Number of these images.
-        scores: Differences of the scores by name.
+        scores: Differences of the scores by name, if they are defined.
         intervals: Their 95 % bootstrap intervals over the images, see `metrics.image_sums`.
     """
 
@@ -51,7 +51,8 @@ def difference(result: EvaluationResult, base: EvaluationResult) -> Difference |
         for of, shared in zip((sums, of_base), places, strict=True)
     ]
     means, drawn = ([score(of, absent) for of in pair] for score in (means_of_sums, drawn_scores))
-    return Difference(len(common), _minus(*means), intervals(_minus(*drawn)))
+    defined = {name: score for name, score in _minus(*means).items() if not np.isnan(score)}
+    return Difference(len(common), defined, intervals(_minus(*drawn)))
 
 
 def _minus(scores: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tangent_train.errors import listed
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.metrics.scores import SOLID_ANGLE
 from tangent_train.results.chart import report_png
@@ -132,20 +129,15 @@ class Report:
 
     def differences(self) -> Table:
         """Return the table of the differences from the first run; no rows without differences."""
-        found = [(row, row.difference) for row in self.rows if row.difference is not None]
-        columns = {
-            name: column
-            for name, column in self.first.columns.items()
-            if (column.is_main or column.of_sphere) and any(name in of.scores for _, of in found)
-        }
-        rows = []
-        for row, of in found:
-            count = row.results[0].images
-            images = f"{of.images} of {count}" if of.images < count else str(count)
-            cells = (_signed(of, name, column.unit) for name, column in columns.items())
-            rows.append((row.label, images, *cells))
-        header = ("", self.first.noun, *(column.title for column in columns.values()))
-        return Table(f"Difference from {self.base}", header, rows, _LEGEND_OF_DIFFERENCES)
+        found = {row.label: row.difference for row in self.rows if row.difference is not None}
+        rows = [(f"{self.first.noun} of both", *(str(of.images) for of in found.values()))]
+        for name, column in self.first.columns.items():
+            is_shown = column.is_main or column.of_sphere
+            if is_shown and any(name in of.scores for of in found.values()):
+                cells = (_signed(of, name, column.unit) for of in found.values())
+                rows.append((column.title, *cells))
+        title = f"Difference from {self.base}"
+        return Table(title, ("", *found), rows if found else [], _LEGEND_OF_DIFFERENCES)
 
     def sphere(self, condition: str | None = None) -> Table:
         """Return the table of the scores that only panoramas have; no rows without such scores.
@@ -246,9 +238,8 @@ def _change(ratio: float | None) -> str:
 
 def _signed(found: Difference, name: str, unit: str) -> str:
     """Return a difference with its sign and its interval."""
-    score = found.scores.get(name, math.nan)
-    text = score_text(None if math.isnan(score) else score, unit, found.intervals.get(name))
-    return "+" * (score > 0) + text
+    score, interval = found.scores.get(name), found.intervals.get(name)
+    return "+" * (score is not None and score > 0) + score_text(score, unit, interval)
 
 
 def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) -> Report:
@@ -270,18 +261,14 @@ def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) 
         if name not in ("data", "classes") and len({p.get(name) for p in protocols}) > 1
     ]
     rows, sources = _rows(group_results(results), shown)
-    base, reasons = rows[0], defaultdict(list)
+    base, missing = rows[0], []
     for place, row in enumerate(rows[1:], start=1):
         if len(row.results) == len(base.results) == 1:
             found = difference(row.results[0], base.results[0])
             if isinstance(found, Difference):
                 rows[place] = replace(row, difference=found)
             else:
-                reasons[found].append(row.label)
-    missing = [
-        f"{listed(labels)}: no difference from {base.label}: {reason}."
-        for reason, labels in reasons.items()
-    ]
+                missing.append(f"{row.label}: no difference from {base.label}: {found}.")
     rows.sort(
         key=lambda row: (
             row.facts["data"],

@@ -395,7 +395,8 @@ class PixelTask(Task):
 
     def _evaluated_views(self, sets: Iterable[Any]) -> Iterator[tuple[Any, Tensor, Any]]:
         """Yield views, their scores (see `scored_views`), and all outputs, for `loss_sum`."""
-        for views, scores, outputs in scored_views(self, sets, self.eval_view_batch_size):
+        how = self.eval_view_batch_size, getattr(self.network, "takes_all_views", False)
+        for views, scores, outputs in scored_views(self, sets, *how):
             yield views, scores, {**outputs, "out": scores}
 
     @torch.no_grad()

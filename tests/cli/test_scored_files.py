@@ -169,6 +169,51 @@ def test_turned_predictions_are_noticed(
     assert name is None or " on 3 panoramas." in error
 
 
+def test_predictions_are_checked(data: Any, run: Run, tmp_path: Path, capsys: Capture) -> None:
+    """One mirrored prediction, one of another size, one missing, and a stranger."""
+    files = {"0": data["hall/0"][:, ::-1], "1": data["hall/1"][:16], "stranger": data["hall/0"]}
+    for name, labels in files.items():
+        _save(tmp_path / "maps" / f"{name}.png", labels)
+    with pytest.raises(SystemExit) as stopped:
+        run("check", "predictions=maps", *DATA)
+    out, err = capsys.readouterr()
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in out.splitlines()]
+    cells = {row[0]: row[1:] for row in rows if row}
+    unknown, dark = (f"{100 * np.mean(data['hall/0'] == label):.1f}" for label in (0, 1))
+    assert stopped.value.code == 1
+    assert cells == cells | {
+        "usable predictions": ["1"],
+        "images without a prediction": ["1"],
+        "unusable predictions": ["1"],
+        "files of no test image": ["1"],
+        "unknown": [unknown, unknown],
+        "dark": [dark, dark],
+        "mirrored left to right": ["100.0"],
+    }
+    assert "Warning: mirrored left to right, predictions score mIoU 100.0 instead of" in out
+    assert "hall/2" in err
+    assert "stranger.png" in err
+    assert not (tmp_path / "runs").exists(), "nothing is written"
+
+
+def test_right_distances_pass_the_check(
+    data: Any, run: Run, tmp_path: Path, capsys: Capture
+) -> None:
+    steps = np.full((32, 64), 2000, np.uint16)
+    steps[:, 32:], steps[:8] = 3000, 0
+    for name in (*data, "hall/3"):
+        _save(tmp_path / "data" / "depth" / f"{name}.png", steps)
+        _save(tmp_path / "maps" / f"{name}.npy", np.maximum(steps, 1000) * np.float32(1e-3))
+    (tmp_path / "maps/hall/3.npy").unlink()
+    run("check", "predictions=maps", *DATA, "task=depth")
+    out = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in out.splitlines()]
+    cells = {row[0]: row[1:] for row in rows if row}
+    assert (cells["usable predictions"], cells["distance"]) == (["3"], ["100.0", "75.0"])
+    assert float(cells["as they are"][0]) < 1e-3 < float(cells["mirrored left to right"][0])
+    assert "Warning" not in out
+
+
 @pytest.mark.parametrize("is_placed", [False, True])
 def test_partial_panoramas(data: Any, run: Run, tmp_path: Path, is_placed: bool) -> None:
     """Files of the part that the images show, or of whole panoramas."""

@@ -30,7 +30,8 @@ def test_outputs_of_every_kind_are_distances_along_the_rays(kind: DepthKind) -> 
         "log_distance": distance.log(),
         "metric_distance": distance,
         "metric_z": 2,
-        "canonical_inverse": 1 / (2 * 2),  # the image is 2 m wide at 1 m
+        "canonical_z": 2 * 2,  # the image is 2 m wide at 1 m
+        "canonical_inverse": 1 / (2 * 2),
         "relative_z": 2,
         "relative_depth": 2,
         "relative_disparity": 1 / 2,

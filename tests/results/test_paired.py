@@ -162,13 +162,12 @@ def test_only_common_images_count_and_reasons_are_named(tmp_path: Path) -> None:
     ]
     report = runs_report(results)
     table = report.differences()
-    (row,) = table.rows
-    cells = dict(zip(table.header, row, strict=True))
+    cells: dict[str, str] = dict(map(tuple, table.rows))  # type: ignore[arg-type]
     common = {name: _noisy(truths, 0.3, 0)[name] for name in some}
     stacked = [np.stack([of[name] for name in some]) for of in (common, truths)]
     assert table.title == "Difference from first (variant=first)"
-    assert cells[""] == "second"
-    assert cells["panoramas"] == "4 of 6"
+    assert table.header == ("", "second")
+    assert cells["panoramas of both"] == "4"
     assert cells["mIoU %"].startswith(f"{100 * (_miou(*stacked) - 1):.1f} [-")
     assert report.notes == [
         f"{label}: no difference from first (variant=first): {reason}."

@@ -1,0 +1,96 @@
+"""Depth Anything 3: its cameras, with a stand-in; its networks, if the package is installed."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import tangent_train as tt
+from models import DepthAnything3
+from tangent_train.checkpoints.loaded import load_network
+from tangent_train.errors import SettingError
+from tangent_train.inference.export import export_network
+from tangent_train.photo_networks import PhotoNetwork, import_network
+from tests.inference.test_many_views import (
+    SHAPE,
+    UNIT,
+    Ball,
+    many_view_network,
+    predicted,
+    true_distances,
+)
+from tests.inference.trained import sphere
+
+
+class StandIn(Ball):
+    """Sees the ball-shaped room in the axes of its first camera, in the package's conventions."""
+
+    first: Tensor
+
+    def forward(self, images: Tensor, extrinsics: Tensor, intrinsics: Tensor) -> Any:
+        camera_from_world, matrix = extrinsics[0, :, :3, :3], intrinsics[0].clone()
+        assert torch.equal(extrinsics[0, :, :3, 3], torch.zeros(len(matrix), 3))
+        torch.testing.assert_close(camera_from_world[0], torch.eye(3))
+        assert tuple(matrix[0, :2, 2] * 2) == (images.shape[-1], images.shape[-2])
+        matrix[:, :2, 2] -= 0.5
+        found = super().forward(images[0], self.first @ camera_from_world.mT, matrix)
+        depth = found["out"][None]
+        return {"depth": depth, "depth_conf": depth + 1, "extrinsics": extrinsics[:, :, :3]}
+
+
+def test_cameras_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = {"create_object": StandIn, "load_config": lambda preset: preset}
+    for name, content in (
+        ("cfg", config),
+        ("registry", {"MODEL_REGISTRY": {"da3-small": "right"}}),
+        ("utils.logger", {"logger": SimpleNamespace(level=2)}),
+    ):
+        monkeypatch.setitem(sys.modules, f"depth_anything_3.{name}", SimpleNamespace(**content))
+    for name in ("depth_anything_3", "depth_anything_3.utils"):
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(__path__=[]))
+    network = DepthAnything3("da3-small")
+    network.size_multiple = 1
+    network.register_forward_pre_hook(
+        lambda _, inputs: setattr(network.model, "first", inputs[1][0])
+    )
+    mosaic = predicted(replace(many_view_network(network), depth_kind="relative_z"))
+    ratio = mosaic.pixels().numpy() / true_distances()
+    np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=1e-4)
+    assert float(mosaic.facts["rotation_error_deg"]) < 1e-2
+
+
+def test_a_missing_package_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "depth_anything_3", None)
+    with pytest.raises(SettingError, match="pip install --no-deps depth-anything-3 addict einops"):
+        DepthAnything3()
+    with pytest.raises(SettingError, match="preset: found 'da3metric-large'; expected 'da3-small'"):
+        DepthAnything3("da3metric-large")
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_a_network_of_the_package_is_imported_predicts_and_is_exported(tmp_path: Path) -> None:
+    """With random weights."""
+    pytest.importorskip("depth_anything_3")
+    torch.manual_seed(0)
+    settings = {"_target_": "models.DepthAnything3", "preset": "da3-small"}
+    module = DepthAnything3("da3-small")
+    photo_network = PhotoNetwork(module, settings, (), UNIT, (56, 56), depth_kind="relative_z")
+    loaded = import_network(photo_network, tmp_path / "net.ckpt")
+    assert (loaded.size_multiple, loaded.fixed_size) == (14, None)
+    network = tt.load(tmp_path / "net.ckpt", views="cubemap")
+    depth = network.depth(sphere(SHAPE[0]))
+    assert depth.shape == SHAPE
+    assert np.isfinite(depth).all()
+    export_network(loaded, tmp_path / "net.safetensors")
+    again = load_network(tmp_path / "net.safetensors").module.state_dict()
+    assert all(torch.equal(again[n], tensor) for n, tensor in module.state_dict().items())
+    with pytest.raises(SettingError, match="without their cameras"):
+        export_network(loaded, tmp_path / "net.onnx")
