@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import lightning
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
 from lightning.pytorch.utilities import rank_zero_only
@@ -15,10 +17,15 @@ from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
 from tangent_train.cli.scored_files import OF_FILES, score_files
+from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import EvaluateSettings, refuse_typed
-from tangent_train.errors import SettingError, listed
+from tangent_train.errors import SettingError, check_choice, listed
 from tangent_train.inference.api import load_label_map, map_classes
-from tangent_train.inference.views import check_size, panorama_settings
+from tangent_train.inference.engine import Predictor
+from tangent_train.inference.images import InputImage, read_panorama
+from tangent_train.inference.views import ViewSelector, check_size, panorama_settings
+from tangent_train.io.jobs import Inputs
+from tangent_train.progress import show_progress
 
 
 def evaluate(settings: EvaluateSettings) -> None:
@@ -34,6 +41,8 @@ def evaluate(settings: EvaluateSettings) -> None:
         score_files(settings, folder)
         return
     refuse_typed(OF_FILES, "nothing: it is read with predictions=")
+    if settings.input is not None:
+        refuse_typed(("data", "experiment", "panels"), "nothing: input= has no labels")
     checkpoint = settings.checkpoint
     if checkpoint is None:
         expected = "a network, or predictions=<folder>"
@@ -43,11 +52,12 @@ def evaluate(settings: EvaluateSettings) -> None:
     head: Any = get_class(settings.task["head"]["_target_"])
     loaded.check_predicts(head.kind, remedy)
     settings = settings.model_copy(update=_of_network(settings, loaded))
-    data, notes = build_data(settings), []
+    data, notes = build_data(settings) if settings.input is None else None, []
     if settings.label_map is not None:
-        label_map = load_label_map(settings.label_map)
-        mapped = map_classes(loaded, label_map, settings.unmapped, data.class_names[1:])
+        label_map, targets = load_label_map(settings.label_map), data and data.class_names[1:]
+        mapped = map_classes(loaded, label_map, settings.unmapped, targets)
         loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped.description}."]
+    data = data or _unlabeled(settings, loaded)
     if loaded.class_names != tuple(data.class_names):
         raise SettingError(
             f"data, for {settings.checkpoint}",
@@ -61,10 +71,46 @@ def evaluate(settings: EvaluateSettings) -> None:
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)
     head = build_head(settings, data, loaded.depth_kind)
+    if settings.consistency or settings.input is not None:
+        head.consistency = rank_zero_only(_rotated)(settings, loaded, head, data) or {}
     task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
     rank_zero_only(run.write_settings)()
-    run.test(run.trainer(), checkpoint)
+    if settings.input is None:
+        run.test(run.trainer(), checkpoint)
+    else:
+        task.result = None
+        run.report(checkpoint, range(len(data.splits()["test"])), ())
+
+
+def _unlabeled(settings: EvaluateSettings, loaded: LoadedNetwork) -> Any:
+    """Return what takes the place of a data set for panoramas without labels."""
+    representation = build_from_config(settings.representation or {}, "representation")
+    inputs = Inputs.find(str(settings.input))
+    jobs = list(inputs.jobs(inputs.names))
+    return SimpleNamespace(
+        noun="panoramas" + " without depth" * ("depth" in loaded.inputs),
+        splits=lambda: {"test": jobs}, groups=lambda _: (), folds=(),
+        facts={"data": str(settings.input)}, class_names=loaded.class_names,
+        representation=representation,
+    )  # fmt: skip
+
+
+def _rotated(settings: EvaluateSettings, loaded: LoadedNetwork, head: Any, data: Any) -> Any:
+    """Return the scores of `Predictor.consistency` of all panoramas, arrays by name."""
+    check_choice("data, with consistency=", data.noun, ("panoramas",))
+    items = data.splits()["test"]
+    if settings.input is None:
+        read = map(data.dataset("test").read, range(len(items)))
+        images = (InputImage(i.rgb, i.depth, i.up, area=data.canvas) for i in read)
+    else:
+        images = (read_panorama(job.value or job.path) for job in items)
+    views, rng = ViewSelector(loaded), np.random.default_rng(settings.seed)
+    views.representation = data.representation
+    predictor, found = Predictor(loaded, head, views, "auto"), list[dict[str, float]]()
+    scores = (predictor.consistency(i, settings.consistency or 8, rng) for i in images)
+    show_progress(map(found.append, scores), "Rotating", "panoramas", len(items))
+    return {name: np.array([of_image[name] for of_image in found]) for name in found[0]}
 
 
 @rank_zero_only

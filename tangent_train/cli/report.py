@@ -38,11 +38,7 @@ def report(arguments: Sequence[str]) -> None:
     notes = [f"{run}: not finished, ignored." for run in begun]
     runs = runs_report([load_result(folder) for folder in finished], notes)
     runs.write(options.output, "report")
-    for table in (runs.means(), runs.differences(), runs.sphere()):
-        if table.rows:
-            table.print()
-    for note in runs.notes:
-        print_text(f"- {note}")
+    runs.print()
     print_text(f"Files: {options.output}/report.*")
 
 

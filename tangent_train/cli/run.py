@@ -45,6 +45,7 @@ from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.inference.engine import UpLikelihood
+from tangent_train.metrics.image_sums import as_sums
 from tangent_train.results import evaluation
 from tangent_train.results.page import write_report
 from tangent_train.results.published import published_rows, published_table
@@ -182,8 +183,9 @@ class Run:
         for place, files in enumerate(items):
             for group in data.groups(files):
                 groups[group].append(place)
-        sums = head.image_sums(task.result)
+        sums = {} if task.result is None else head.image_sums(task.result)
         sums = {name: values[np.argsort(order)] for name, values in sums.items()}
+        sums |= as_sums(head.consistency)
         # A relative path stays right when the folder is moved.
         is_inside = checkpoint.is_relative_to(self.folder)
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
@@ -206,14 +208,15 @@ class Run:
         shown = [f"Shown: {len(images)} of {result.images} {data.noun}, the worst first."]
         write_report(
             self.folder / "report.html",
-            f"{network} on {type(data).__name__} ({checkpoint.name})",
+            f"{network} on {data.facts['data']} ({checkpoint.name})",
             tables=[*tables, *([evaluation.confusion_table(result)] if result.confusion else [])],
             images=images,
             class_names=head.class_names,
             notes=[*summary, *notes, *shown * bool(images)],
         )
         print_text("\n".join([*self.notes, *summary]))
-        tables[0].print()
+        for table in tables[:2]:
+            table.print()
         print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
 

@@ -39,7 +39,7 @@ OF_FILES = ("values", "files", "resample", "depth_scale", "depth_channel")
 _OF_NETWORKS = (
     *("checkpoint", "trust", "label_map", "unmapped", "level", "trainer", "logger"),
     *("representation(?!.erp_height)", "data.inputs", "data.normalization"),
-    *("data.test_rotation", "data.upright"),
+    *("data.test_rotation", "data.upright", "consistency", "input"),
 )
 _ARRAYS = (".npy", ".npz")
 _SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".exr", *_ARRAYS)

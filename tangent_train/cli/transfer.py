@@ -298,12 +298,7 @@ def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
         cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}
         name, report = "transfer", transfer_report(results, cells)
     report.write(folder, name)
-    conditions = [condition for _, condition in report.cells.values()]
-    for table in (report.tables()[0], report.sphere(next(iter(conditions), None))):
-        if table.rows:
-            table.print()
-    for note in report.notes:
-        print_text(f"- {note}")
+    report.print()
     print_text(f"Tables and a chart: {folder / name}.md, .csv, .png")
 
 

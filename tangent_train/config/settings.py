@@ -154,6 +154,11 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """depth: align the views with each other: none | scale | affine | grid (scales that vary within
     a view); null = by the kind of depth"""
 
+    align_across: Literal["frames"] | ExistingPath | None = None
+    """depth: bring all panoramas to one scale: frames (of a video, or of a folder in order, each
+    near the next) | their poses, in whose unit depth is then (the JSON file of tangent-render
+    poses=, or a folder of a sparse COLMAP model); null = each has its own"""
+
     # --- output ---
     output: Path
     """folder for the results"""
@@ -482,6 +487,14 @@ class TrainSettings(RunSettings):
 class FilesSettings(RunSettings):
     """Settings of commands that read predictions of any program."""
 
+    # --- consistency ---
+    consistency: NonNegativeInt = 0
+    """panoramas: compare predictions for this number of turns about the vertical, and for as many
+    random rotations, with the first prediction; 0 = none (8 with input=)"""
+    input: str | Path | None = None
+    """only consistency, of panoramas without labels, instead of data=: panorama or video, folder of
+    them, or pattern, e.g. 'holiday/*.jpg'"""
+
     # --- predictions of any program ---
     predictions: ExistingPath | None = None
     """folder of predictions of any program, which are scored instead of a network: label maps,
@@ -732,7 +745,7 @@ def _example(command: str) -> str:
 def missing_groups(command: str) -> list[str]:
     """Return ["data"] if the command line of a run chooses no data set, neither by experiment."""
     is_own = HydraConfig.get().job.config_name == command  # not that of a resumed run or a stage
-    chosen = any(is_within(name, ("data", "experiment")) for name in typed_names())
+    chosen = any(is_within(name, ("data", "experiment", "input")) for name in typed_names())
     needs_data = issubclass(SETTINGS[command], RunSettings) and is_own and not chosen
     return ["data"] * needs_data
 

@@ -108,6 +108,8 @@ class Head(nn.Module, ABC):
         predict_settings: Settings of ``tangent-predict`` that are arguments of the head, each with
             the kind of output or the other setting that it needs; "" for none.
         is_metric: False for distances that are known up to a scale.
+        consistency: Scores of `agreement` of each image ``(images,)``, by name of the column, if
+            they are measured.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind (`source`)
             holds the predicted pixels, from which pictures are drawn.
         usual_kinds: Kinds that are written by default, besides the first.
@@ -129,6 +131,7 @@ class Head(nn.Module, ABC):
     waits: ClassVar[bool] = False
     num_outputs: int
     is_metric: bool = True
+    consistency: Mapping[str, NDArray[np.float64]] = NOTHING
     suffixes: Mapping[str, str] = NOTHING
     summary_columns: Sequence[str] = ()
 
@@ -188,6 +191,14 @@ class Head(nn.Module, ABC):
 
         Args:
             result: Value of the metric.
+        """
+        return {}
+
+    def agreement(self, first: PredictedImage, other: PredictedImage) -> dict[str, float]:
+        """Compare the prediction for a rotated panorama, brought back, with the first one.
+
+        Returns:
+            Scores by the names in `sphere_columns`, by solid angle; NaN if undefined.
         """
         return {}
 

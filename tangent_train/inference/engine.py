@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch.utils._pytree import tree_map_only
 
 from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import STEPS_PER_M, resize_depth
@@ -28,10 +29,12 @@ from tangent_train.checkpoints.outputs import (
     network_for_views,
 )
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid
+from tangent_train.geometry import TangentGrid, random_rotation, rotation_about
 from tangent_train.geometry.sphere import equirect_elevations
+from tangent_train.heads.base import PredictedImage
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import ViewSelector
+from tangent_train.metrics.scores import TURNS
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import CubemapRepresentation
 from tangent_train.rendering.resampling import resize
@@ -280,10 +283,9 @@ class Predictor:
             return network
         compiled: Any = torch.compile(network, **self._compile)
         # The next call of a CUDA graph overwrites the output of the last.
-        return lambda *given, **named: {
-            name: output.clone()
-            for name, output in named_outputs(compiled(*given, **named)).items()
-        }
+        return lambda *given, **named: tree_map_only(
+            torch.Tensor, torch.clone, dict(named_outputs(compiled(*given, **named)))
+        )
 
     @torch.no_grad()
     def predict(
@@ -330,6 +332,35 @@ class Predictor:
                 mosaic.facts["rotation_error_deg"] = outputs["rotation_error_deg"]
             progress(len(views) / count)
         return mosaic
+
+    def consistency(self, image: InputImage, number: int, rng: Any) -> dict[str, float]:
+        """Compare the predictions for a rotated panorama with that for the panorama itself.
+
+        The views are rotated, so that nothing but the views is resampled. That is a rotation of
+        the panorama by the inverse; all predictions have the orientation of the panorama.
+
+        Args:
+            image: The panorama.
+            number: Number n of rotations of each of `TURNS`. Turns are by multiples of 360° / (n +
+                1), rounded to whole columns of an equirectangular image, which are not resampled.
+            rng: Source of the random rotations, a `numpy.random.Generator`.
+
+        Returns:
+            Means over the rotations of the scores of `Head.agreement`, by name of the column.
+        """
+        columns = max(self._views.image_size(image)[1], 2 * self._views.image_size(image)[0])
+        angles = np.rint(np.arange(1, number + 1) * columns / (number + 1)) * 2 * np.pi / columns
+        turns = [t for a in angles for t in (rotation_about((0, 0, 1), a), random_rotation(rng))]
+        upright = np.eye(3) if image.up is None else upright_rotation(image.up)
+        rotated = (replace(image, up=r[:, 2], rotation=r) for r in upright @ np.array(turns))
+        images = (image, *rotated)
+        first, *others = (PredictedImage.fetch(i, self.predict(i).pixels(), {}) for i in images)
+        found = [self.head.agreement(first, other) for other in others]
+        return {
+            f"consistency_{name}_{turn}": float(np.mean([scores[name] for scores in found[k::2]]))
+            for k, turn in enumerate(TURNS)
+            for name in found[k]
+        }
 
 
 class UpLikelihood:

@@ -53,6 +53,8 @@ class InputImage:
         up: ``(3,)`` direction of the zenith in a panorama; None if it is z.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for panoramas.
         area: The part of the sphere that a panorama shows; it is black elsewhere. None for photos.
+        rotation: ``(3, 3)`` rotation of the views of a panorama with `up`; None for the smallest
+            one that turns z to `up`.
     """
 
     rgb: NDArray[np.uint8]
@@ -60,6 +62,7 @@ class InputImage:
     up: NDArray[np.float64] | None = None
     camera_matrix: NDArray[np.float64] | None = None
     area: PanoramaArea | None = None
+    rotation: NDArray[np.float64] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -188,7 +188,7 @@ class ViewSelector:
         if image.area is not None:
             image = replace(image, rgb=image.area.filled(image.rgb, self._fill))
         if image.up is not None:
-            rotation = upright_rotation(image.up)
+            rotation = upright_rotation(image.up) if image.rotation is None else image.rotation
             representation = representation.with_rotation(rotation)
         rows = representation.erp_height
         shape = (rows, 2 * rows) if image.shape[0] > rows else image.shape

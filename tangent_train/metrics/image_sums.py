@@ -25,8 +25,10 @@ AbsentClass = Literal["skip", "zero"]
 Sums = Mapping[str, NDArray[np.float64]]
 """Numbers of images ``(images, …)``, or their sums. Of classes: ``pixels``, and of panoramas
 ``solid_angle``, ``regions`` and ``seam``, see `SegmentationCounts`. Of panoptic maps: ``things``
-and ``stuff``, see `panoptic_scores`. Of other outputs, each score has two numbers: its value and 1,
-or 0 and 0 if it is undefined."""
+and ``stuff``, see `panoptic_scores`. Each other score has two numbers: its value and 1, or 0 and 0
+if it is undefined."""
+
+_OF_CLASSES = ("pixels", "solid_angle", "regions", "seam")
 
 
 def as_sums(scores: Mapping[str, Float[np.ndarray, " images"]]) -> Sums:
@@ -49,10 +51,12 @@ def scores_of_sums(sums: Sums, absent_class: str = "skip") -> dict[str, NDArray[
     """
     if "things" in sums:
         return panoptic_scores(sums["things"], sums["stuff"])
+    pairs = {name: of for name, of in sums.items() if name not in _OF_CLASSES}
+    numbers = {name: np.where(of[..., 1] > 0, of[..., 1], np.nan) for name, of in pairs.items()}
+    scores = {name: sums[name][..., 0] / number for name, number in numbers.items()}
     if "pixels" not in sums:
-        numbers = {name: np.where(of[..., 1] > 0, of[..., 1], np.nan) for name, of in sums.items()}
-        return {name: sums[name][..., 0] / number for name, number in numbers.items()}
-    scores = mean_scores(sums["pixels"], absent_class)
+        return scores
+    scores |= mean_scores(sums["pixels"], absent_class)
     if "seam" not in sums:
         return scores
     regions = mean_scores(sums["regions"], absent_class)["miou"]

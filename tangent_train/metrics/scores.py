@@ -72,20 +72,32 @@ def with_solid_angle(columns: Mapping[str, ScoreColumn]) -> dict[str, ScoreColum
     }
 
 
-def sphere_columns(text: str, unit: str = "%", better: str = "higher") -> dict[str, ScoreColumn]:
+TURNS = {"yaw": "under turns about the vertical", "so3": "under random rotations"}
+"""Kinds of rotations under which the consistency of a network is measured."""
+
+
+def sphere_columns(
+    text: str, unit: str = "%", better: str = "higher", **consistency: str
+) -> dict[str, ScoreColumn]:
     """Return the columns of the scores of panoramas, see `metrics.sphere`.
 
     Args:
         text: Name of the score that is compared between regions.
         unit: Its unit.
         better: Its better direction.
+        **consistency: Texts of the scores of `Head.agreement`, by name.
     """
     how: dict[str, Any] = {"is_main": False, "of_sphere": True}
     gaps = {"pole_gap": "near the poles, minus horizon", "seam_gap": "near the seam, minus others"}
     columns = {
         name: ScoreColumn(f"{text} {of}", unit, better=better, **how) for name, of in gaps.items()
     }
-    return columns | {"seam_step": ScoreColumn("step across the seam", unit, better="lower", **how)}
+    columns["seam_step"] = ScoreColumn("step across the seam", unit, better="lower", **how)
+    return columns | {
+        f"consistency_{name}_{turn}": ScoreColumn(f"{text} {under}", better=better, **how)
+        for turn, under in TURNS.items()
+        for name, text in consistency.items()
+    }
 
 
 BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml  # type: ignore[import-untyped]
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from tangent_train.errors import DataError, counted, listed
 from tangent_train.files import csv_text, read_json, write_bytes, write_text
-from tangent_train.metrics.image_sums import Sums, drawn_scores, intervals, means_of_sums
+from tangent_train.metrics.image_sums import Sums, as_sums, drawn_scores, intervals, means_of_sums
 from tangent_train.metrics.scores import BAND_EDGES_DEG, SOLID_ANGLE, Interval, ScoreColumn
 from tangent_train.results.tables import Table, markdown_text, score_text
 
@@ -135,12 +134,17 @@ def evaluation_result(
 
     Args:
         head: Head that the scores come from.
-        result: Value of its metric.
+        result: Value of its metric; None if only the consistency was measured.
         noun: Plural name of the images: panoramas, photos, shapes.
         images: Number of images.
         sums: Numbers of each image (`Head.image_sums`); None for the order of the evaluation.
         groups: Places of the images of each group in these.
     """
+    consistency = plain_scores(means_of_sums(as_sums(head.consistency)))
+    if result is None:
+        columns = {name: replace(head.columns[name], is_main=True) for name in consistency}
+        ends = intervals(drawn_scores(sums or {}))
+        return EvaluationResult(noun, images, columns, consistency, intervals=ends)
     sums = head.image_sums(result) if sums is None else sums
     absent = head.facts.get("absent_class", "skip")
     means, of_classes, bands, confusion = head.scores(result)
@@ -151,7 +155,7 @@ def evaluation_result(
         noun,
         images,
         head.columns,
-        {**plain_scores(means), **{name: None for name in head.columns if name not in means}},
+        {**plain_scores(means), **{n: None for n in head.columns if n not in means}, **consistency},
         classes=[
             {"class": name} | plain_scores(dict(zip(of_classes, values, strict=True)))
             for name, values in zip(names, scores, strict=True)
@@ -252,13 +256,7 @@ def result_tables(result: EvaluationResult) -> list[Table]:
         result: The evaluation.
     """
     tables = [_per_class(result) if result.classes else _over_all(result)]
-    of_sphere = [
-        [column.title, _mean(result, name)]
-        for name, column in result.columns.items()
-        if column.of_sphere and result.scores.get(name) is not None
-    ]
-    if of_sphere:
-        tables.append(Table("On the sphere", ("score", f"over all {result.noun}"), of_sphere))
+    tables.append(_over_all(result, "On the sphere", of_sphere=True))
     bands = [
         {"latitude": "{}° … {}°".format(*band["latitude_deg"]), **band}
         for band in result.latitude_bands
@@ -276,7 +274,7 @@ def result_tables(result: EvaluationResult) -> list[Table]:
                 for entry in entries
             ]
             tables.append(Table(title, [*firsts, *(c.title for c in columns.values())], rows))
-    return tables
+    return [table for table in tables if table.rows]
 
 
 def _mean(result: EvaluationResult, name: str) -> str:
@@ -289,13 +287,13 @@ def _is_shown(result: EvaluationResult, name: str) -> bool:
     return bool(result.latitude_bands) or not name.endswith(SOLID_ANGLE)
 
 
-def _over_all(result: EvaluationResult) -> Table:
+def _over_all(result: EvaluationResult, title: str = "Scores", *, of_sphere: bool = False) -> Table:
     rows = [
         [column.title, _mean(result, name)]
         for name, column in result.columns.items()
-        if _is_shown(result, name) and not column.of_sphere
+        if column.of_sphere == of_sphere and result.scores.get(name) is not None
     ]
-    return Table("Scores", ("score", f"over all {result.noun}"), rows)
+    return Table(title, ("score", f"over all {result.noun}"), rows)
 
 
 def _per_class(result: EvaluationResult) -> Table:
@@ -342,17 +340,6 @@ def write_image_sums(folder: Path, names: Sequence[str], sums: Sums) -> None:
         arrays: dict[str, Any] = {"images": np.array(names, np.str_), **sums}
         np.savez_compressed(content, **arrays)
         write_bytes(folder / SUMS_FILE, content.getvalue())
-
-
-def read_image_sums(folder: Path) -> tuple[NDArray[np.str_], Sums]:
-    """Read the names of the images of an evaluation, and the numbers of each.
-
-    Raises:
-        OSError: The evaluation has no such file.
-    """
-    with np.load(folder / SUMS_FILE, allow_pickle=False) as file:
-        sums = dict(file)
-    return sums.pop("images"), sums
 
 
 def write_results(

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tangent_train.console import print_text
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.metrics.scores import SOLID_ANGLE
 from tangent_train.results.chart import report_png
@@ -78,12 +79,11 @@ class Report:
         for name, mean in first.class_means.items():
             if not name.endswith(SOLID_ANGLE):
                 title = first.columns[mean].class_title
-                parts: dict[str, Part] = {c: c for c in first.class_names}
-                tables.append(self._parts(title[:1].upper() + title[1:], name, parts))
+                parts: dict[str, tuple[str, Part]] = {c: (name, c) for c in first.class_names}
+                tables.append(self._parts(title[:1].upper() + title[1:], parts))
         bands = next((row.bands for row in self.rows if row.bands), [])
-        titles: dict[str, Part] = {f"{band[0]:g}° … {band[1]:g}°": band for band in bands}
-        title = f"{first.columns[first.main].title} by latitude"
-        tables.append(self._parts(title, first.main, titles))
+        parts = {f"{band[0]:g}° … {band[1]:g}°": (first.main, band) for band in bands}
+        tables.append(self._parts(f"{first.columns[first.main].title} by latitude", parts))
         return [table for table in tables if table.rows]
 
     def _views(self) -> Table:
@@ -98,12 +98,12 @@ class Report:
         note = f"{self._legend} {_LEGEND_OF_INTERVALS}"
         return Table(title, ("", *conditions), cells if len(conditions) > 1 else [], note)
 
-    def _parts(self, title: str, name: str, parts: Mapping[str, Part]) -> Table:
-        """Return the table of a score of classes or latitude bands, given by title."""
+    def _parts(self, title: str, parts: Mapping[str, tuple[str, Part]]) -> Table:
+        """Return the table of scores of all images, classes or latitude bands, given by title."""
         rows = [
-            (row.label, *(self._cell(row, name, part) for part in parts.values()))
+            (row.label, *(self._cell(row, *part) for part in parts.values()))
             for row in self.rows
-            if any(row.score(name, part).folds for part in parts.values())
+            if any(row.score(*part).folds for part in parts.values())
         ]
         return Table(title, ("", *parts), rows)
 
@@ -139,26 +139,22 @@ class Report:
         title = f"Difference from {self.base}"
         return Table(title, ("", *found), rows if found else [], _LEGEND_OF_DIFFERENCES)
 
-    def sphere(self, condition: str | None = None) -> Table:
-        """Return the table of the scores that only panoramas have; no rows without such scores.
+    def sphere(self) -> Table:
+        """Return the table of the scores that only panoramas have, in the first condition."""
+        first = next(iter(self.cells.values()), ("", ""))
+        rows = [row for row in self.rows if self.cells.get(row.label, first)[1] == first[1]]
+        columns = {name: c for name, c in self.first.columns.items() if c.of_sphere}
+        scored = [name for name in columns if any(row.score(name).folds for row in rows)]
+        parts = {columns[name].title: (name, None) for name in scored}
+        return replace(self, rows=rows)._parts(f"On the sphere {first[1]}".strip(), parts)
 
-        Args:
-            condition: Condition of the rows, of those that have one; None for all.
-        """
-        conditions = {label: cell[1] for label, cell in self.cells.items() if condition is not None}
-        rows = [row for row in self.rows if conditions.get(row.label, condition) == condition]
-        names = {
-            name: column.title
-            for name, column in self.first.columns.items()
-            if column.of_sphere and any(row.score(name).folds for row in rows)
-        }
-        cells = [
-            (row.label, *(self._cell(row, name) for name in names))
-            for row in rows
-            if any(row.score(name).folds for name in names)
-        ]
-        note = f"{self._legend} {_LEGEND_OF_INTERVALS}"
-        return Table("On the sphere", ("", *names.values()), cells, note)
+    def print(self) -> None:
+        """Print the first table, differences, the table of the sphere, and the notes."""
+        for table in (self.tables()[0], self.differences(), self.sphere()):
+            if table.rows:
+                table.print()
+        for note in self.notes:
+            print_text(f"- {note}")
 
     def _cell(self, row: RunRow, name: str, part: Part = None) -> str:
         """Return a score with its spreads, and "of 2" if it is over fewer folds than the row."""

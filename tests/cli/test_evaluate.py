@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
 from numpy.typing import NDArray
+from PIL import Image
 
 from datamodules.stanford2d3ds.files import CLASSES
+from tangent_train.metrics.scores import TURNS
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
-from tests.inference.trained import ERP, TANGENT, write_checkpoint
+from tests.inference.trained import (
+    ERP,
+    TANGENT,
+    sphere,
+    write_checkpoint,
+    write_depth_checkpoint,
+)
 from tests.running import Capture, Patch
 
 ROOMS = [
@@ -179,3 +187,62 @@ def test_impossible_evaluations_are_refused(
     arguments = [*filter(None, given.values()), *(ROOMS if given["data"] == rooms else [])]
     with pytest.raises(SystemExit, match=message):
         run("evaluate", *arguments)
+
+
+CONSISTENCY = {f"consistency_{name}_{turn}" for name in ("labels", "miou") for turn in TURNS}
+
+
+def test_consistency_is_a_score_beside_the_others(
+    run_folder: Path, rooms: str, tmp_path: Path, run: Run, capsys: Capture
+) -> None:
+    arguments = [_best(run_folder), *ROOMS, rooms, "consistency=2"]
+    run("evaluate", *arguments, "hydra.run.dir=out")
+    assert "equal labels under random rotations" in capsys.readouterr().out
+    content, before = results(tmp_path / "out"), results(run_folder)
+    for name in CONSISTENCY:
+        assert 0 < content["scores"][name] <= 1
+        low, high = content["intervals"].pop(name)
+        assert low <= content["scores"].pop(name) <= high
+        assert before["scores"].pop(name) is None
+    assert content == before
+
+
+def test_consistency_needs_no_labels(
+    network: str, tmp_path: Path, run: Run, capsys: Capture
+) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for number in (1, 2):
+        Image.fromarray(sphere(32 * number)).save(folder / f"{number}.png")
+    run("evaluate", network, "input=in", "consistency=2", "hydra.run.dir=out")
+    content = results(tmp_path / "out")
+    assert content["scores"].keys() == content["columns"].keys() == CONSISTENCY
+    assert content["intervals"].keys() == CONSISTENCY
+    assert (content["images"], content["protocol"]["data"]) == (2, "in")
+    assert min(content["scores"].values()) > 0.8, "smooth colors"
+    assert "equal labels" in (tmp_path / "out" / "report.html").read_text()
+    run("evaluate", network, "input=in", "consistency=2", "representation=erp", "hydra.run.dir=erp")
+    assert results(tmp_path / "erp")["scores"] != content["scores"]
+    capsys.readouterr()
+    run("report", "out", "erp")
+    assert "EquirectRepresentation" in capsys.readouterr().out
+    given = _written(tmp_path / "map.json", MAP)
+    run("evaluate", network, "input=in/1.png", "consistency=1", given, "hydra.run.dir=one")
+    assert results(tmp_path / "one")["intervals"] == {}
+    with pytest.raises(SystemExit, match="data: found a value; expected nothing: input= has no"):
+        run("evaluate", network, "input=in", "data=synthrooms")
+    with pytest.raises(SystemExit, match="consistency: found a value; expected nothing"):
+        run("evaluate", "predictions=in", "data=synthrooms", "consistency=2")
+    rgbd = write_checkpoint(tmp_path / "rgbd.ckpt", TANGENT, 4)
+    with pytest.raises(SystemExit, match="found 'panoramas without depth'; expected 'panoramas'"):
+        run("evaluate", f"checkpoint={rgbd}", "input=in")
+
+
+def test_consistency_of_distances(tmp_path: Path, run: Run) -> None:
+    write_depth_checkpoint(tmp_path / "depth.ckpt")
+    Image.fromarray(sphere(32)).save(tmp_path / "one.png")
+    run("evaluate", "checkpoint=depth.ckpt", "input=one.png", "consistency=2", "task=depth",
+        "hydra.run.dir=out")  # fmt: skip
+    scores = results(tmp_path / "out")["scores"]
+    assert scores.keys() == {"consistency_distance_yaw", "consistency_distance_so3"}
+    assert 0 < scores["consistency_distance_yaw"] < 0.2

@@ -207,11 +207,13 @@ def test_scores_of_the_sphere_are_columns_for_every_view() -> None:
     stages = {"P": [photos], "S": [upright], "S-erp": [tilted], "S-erp-tilted": [tilted]}
     cells = {"S": ("S", "upright"), "S-erp": ("erp", "upright"), "S-erp-tilted": ("erp", "tilted")}
     report = transfer_report(stages, cells)
-    table = report.sphere("upright")
+    table = report.sphere()
+    assert table.title == "On the sphere upright"
     assert table.header == ("", "mIoU near the poles, minus horizon %", "step across the seam % ↓")
     assert table.rows == [("S", "-20.0", "5.0 [-10.0, 20.0]"), ("S-erp", "–", "5.0")]
-    assert [row[0] for row in report.sphere().rows] == ["S", "S-erp", "S-erp-tilted"]
-    assert report.sphere() in report.tables()
+    assert table in report.tables()
+    everywhere = replace(report, cells={}).sphere()
+    assert [row[0] for row in everywhere.rows] == ["S", "S-erp", "S-erp-tilted"]
     assert not transfer_report({"P": [photos]}).sphere().rows
 
 
