@@ -17,7 +17,7 @@ from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted, listed
+from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import check_new
 from tangent_train.geometry import (
     PanoramaPose,
@@ -34,7 +34,6 @@ from tangent_train.io.camera_files import (
     CAMERAS_FILE,
     RIG_FILE,
     CameraFile,
-    View,
     read_cameras,
     read_rig,
     write_cameras,
@@ -77,7 +76,6 @@ def render(settings: RenderSettings) -> None:
         remedy = "Example: tangent-render input=panoramas output=tangent"
         raise SettingError("input, back and poses", found=found, expected=expected, remedy=remedy)
     run, read = _MODES[modes[0]]
-    read = read | (_OF_NERFSTUDIO if settings.nerfstudio else set())
     check_read(settings, {*read, *modes, "output", "overwrite"})
     run(settings, settings.model_dump(mode="json", exclude={*settings.not_content}))
 
@@ -96,7 +94,7 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     cameras = _cameras(settings, 512)  # refuses views before any panorama
     names, masks = inputs.names, mask_reader(None, None)
     is_project = settings.colmap or settings.nerfstudio
-    poses = _poses(settings, names) if settings.nerfstudio else {}
+    poses, points = _world(settings, names) if settings.nerfstudio else ({}, None)
     distances = NamedFiles(settings.depth) if settings.depth else None
     if is_project:  # a camera has images of one size
         rows = _most_rows(settings, inputs)
@@ -114,7 +112,11 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
             end = f"{flat_name(job.name)}{suffix}"
             images, of_images, depths = (
                 {output / folder / (prefix + name): view for prefix, view in rig.items()}
-                for folder, name in (("images", end), ("masks", end + ".png"), ("depths", end))
+                for folder, name in (
+                    ("images", end),
+                    ("masks", end + ".png"),
+                    ("depths", end + ".png"),
+                )
             )
             write_views(image, images, kind, progress)
             write_views(masks(job.name, area), of_images, "nearest", lambda _: None)
@@ -134,34 +136,23 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         done = {name: manifest.finished[name] for name in names if name in manifest.finished}
         panoramas = {f"{flat_name(name)}{suffix}": item["file"] for name, item in done.items()}
         write_rig(output / RIG_FILE, rig, panoramas)
-        if settings.nerfstudio:
-            posed = {end: poses.get(file) or poses.get("") for end, file in panoramas.items()}
-            _write_transforms(settings, output, rig, posed)
+        posed = {end: poses.get(file) or poses.get("") for end, file in panoramas.items()}
+    if settings.nerfstudio:
+        write_transforms(output, rig, posed, points)
     _print_written(output, names, failed)
 
 
-def _write_transforms(
-    settings: RenderSettings,
-    output: Path,
-    rig: Mapping[str, View],
-    poses: Mapping[str, PanoramaPose | None],
-) -> None:
-    """Write Nerfstudio's cameras, of the panoramas that have a pose, and points."""
-    frames = {p + end: (rig[p], pose) for end, pose in poses.items() if pose for p in rig}
-    if missing := [end for end, pose in poses.items() if pose is None]:
-        print_text(f"Without a pose, and left out: {listed(missing)}")
-    is_model = settings.poses is not None and settings.poses.is_dir()
-    write_transforms(output, frames, model_points(settings.poses or Path()) if is_model else None)
+def _world(settings: RenderSettings, names: Sequence[str]) -> tuple[dict[str, PanoramaPose], Any]:
+    """Return poses of panoramas by file, and the points of a COLMAP model or None.
 
-
-def _poses(settings: RenderSettings, names: Sequence[str]) -> dict[str, PanoramaPose]:
-    """Return poses of panoramas by file; a single one, called "", defines the world."""
-    if settings.poses is not None:
-        return poses_from(settings.poses, settings.cameras)
+    A single panorama, called "", defines the world.
+    """
+    if (path := settings.poses) is not None:
+        return poses_from(path, settings.cameras), model_points(path) if path.is_dir() else None
     if len(names) > 1:
         expected = f"poses of the {len(names)} panoramas: a COLMAP model, or a JSON file"
         raise SettingError("poses", found="null", expected=expected)
-    return {"": PanoramaPose(to_right_handed(np.eye(3)), np.zeros(3))}
+    return {"": PanoramaPose(to_right_handed(np.eye(3)), np.zeros(3))}, None
 
 
 def _render_missing(
@@ -325,14 +316,13 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
         _render_views,
         {"every", "area", "eye", "views", "base_level", "level", "dim", "faces", "rotation"}
         | {*_DIRECTIONS, "format"}
-        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"},
+        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"}
+        | {"nerfstudio", "poses", "cameras", "depth", "depth_scale"},
     ),
     "back": (_render_back, {"cameras", "blend", "height", "kind", "depth_channel", "z_depth"}),
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
-
-_OF_NERFSTUDIO = {"nerfstudio", "poses", "cameras", "depth", "depth_scale"}
 
 _SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
 

@@ -154,6 +154,11 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """depth: align the views with each other: none | scale | affine | grid (scales that vary within
     a view); null = by the kind of depth"""
 
+    align_across: Literal["frames"] | ExistingPath | None = None
+    """depth: bring all panoramas to one scale: frames (of a video, or of a folder in order, each
+    near the next) | their poses, in whose unit depth is then (the JSON file of tangent-render
+    poses=, or a folder of a sparse COLMAP model); null = each has its own"""
+
     # --- output ---
     output: Path
     """folder for the results"""
@@ -328,6 +333,14 @@ class ImportSettings(Settings):
     unknown_wins: bool = True
     """pixels whose best class is one of unknown_classes: true = unknown (label 0) | false = the
     best other class"""
+    prompts: dict[str, OneOrMore[str]] | OneOrMore[str] | None = None
+    """texts that name the classes, for CLIPSeg and SAM 3 of huggingface: [chair,"picture frame"] |
+    {seating: [chair, sofa], window: window} | a file with a text per line"""
+    threshold: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    """with prompts: probability that a class must exceed; elsewhere pixels are unknown"""
+    things: OneOrMore[str] = ()
+    """classes of which the network also returns objects, e.g. [chair,table], or all; for universal
+    networks of huggingface"""
 
     # --- photos and views ---
     normalization: str | dict[str, tuple[float, ...]] | None = None

@@ -444,14 +444,16 @@ def _pairs(samples: ViewSamples, is_valid: NDArray[np.bool_]) -> tuple[Indices, 
     return first[is_kept], second[is_kept]
 
 
-def _slopes(entries: Sequence[Floats], unknowns: Sequence[Indices], count: int) -> sparse.csr_array:
+def matrix_rows(
+    entries: Sequence[Floats], unknowns: Sequence[Indices], count: int
+) -> sparse.csr_array:
     """Return the ``(m, count)`` matrix with k entries in each row, at the numbers of unknowns."""
     values, columns = np.stack(entries, axis=-1), np.stack(unknowns, axis=-1)
     starts = np.arange(0, values.size + 1, len(entries))
     return sparse.csr_array((values.ravel(), columns.ravel(), starts), (len(values), count))
 
 
-def _robust_fit(
+def robust_fit(
     evaluate: Callable[[Floats], tuple[Floats, sparse.csr_array]],
     start: Floats,
     prior: sparse.csr_array | None = None,
@@ -490,8 +492,8 @@ def _fit_scales(pairs: _Pairs, logs: Floats, count: int) -> Floats:
     """Return scales ``(N,)``."""
     first, second, a, b = pairs
     ones, offset = np.ones(len(a)), logs[first] - logs[second]
-    slopes = _slopes([ones, -ones], [a, b], count)
-    return np.exp(_robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count)))
+    slopes = matrix_rows([ones, -ones], [a, b], count)
+    return np.exp(robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count)))
 
 
 def _fit_affine(
@@ -521,10 +523,10 @@ def _fit_affine(
             scale[a] * factor[first] / noise * has_shift[a],
             -scale[b] * factor[second] / noise * has_shift[b],
         ]
-        return residual, _slopes(entries, [a, b, count + a, count + b], 2 * count)
+        return residual, matrix_rows(entries, [a, b, count + a, count + b], 2 * count)
 
     prior = sparse.diags_array(np.repeat([1 / _SCALE_PRIOR, 1 / _SHIFT_PRIOR], count)).tocsr()
-    fit = _robust_fit(evaluate, np.concatenate([np.log(unit), np.zeros(count)]), prior)
+    fit = robust_fit(evaluate, np.concatenate([np.log(unit), np.zeros(count)]), prior)
     scale = np.exp(fit[:count])
     return scale / unit, scale * fit[count:], is_constant
 
@@ -545,7 +547,7 @@ def _fit_grid(pairs: _Pairs, logs: Floats, samples: ViewSamples) -> tuple[Floats
     small = sparse.vstack([smooth / _SLOPE_PRIOR, sparse.eye_array(nodes) / _NODE_PRIOR])
     prior = sparse.kron(sparse.eye_array(count), small).tocsr()
     start = np.zeros(count * nodes)
-    fit = _robust_fit(lambda x: (slopes @ x + offset, slopes), start, prior)
+    fit = robust_fit(lambda x: (slopes @ x + offset, slopes), start, prior)
     return fit.reshape(count, _NODES, _NODES), at_samples @ fit
 
 

@@ -23,7 +23,7 @@ from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
 from tangent_train.io.palette import class_colors
 from tangent_train.io.pixel_files import array_file, read_pixels
 from tangent_train.metrics import segmentation
-from tangent_train.metrics.image_sums import AbsentClass, Sums, means_of_sums
+from tangent_train.metrics.image_sums import AbsentClass, Sums, class_scores, means_of_sums
 from tangent_train.metrics.scores import (
     ScoreColumn,
     by_solid_angle,
@@ -158,11 +158,13 @@ class ClassesHead(Head):
             (score(band) if band.any() else score(band, absent_class="skip")).means
             for band in result.bands
         ]
-        means = means_of_sums(self.image_sums(result), self.absent_class)
+        sums = self.image_sums(result)
+        means = means_of_sums(sums, self.absent_class)
         of_pixels = score(result.pixels)
         of_classes = of_pixels.of_classes
         if len(result.seam):
-            of_classes |= by_solid_angle(score(result.solid_angle).of_classes)
+            steradians = sums["solid_angle"].sum(axis=0)
+            of_classes |= by_solid_angle(class_scores(steradians, self.absent_class))
         of_classes |= {"share": of_pixels.share}
         return Scores(means, of_classes, bands if len(result.seam) else (), result.pixels)
 

@@ -17,16 +17,16 @@ from torch import Tensor
 
 from datamodules.core.depth import STEPS_PER_M
 from datamodules.core.label_map import DISTANCE
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, of_extra
+from tangent_train.files import write_bytes
 from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, to_right_handed
 from tangent_train.geometry.normals import equirect_normals, pinhole_normals
 from tangent_train.heads import alignment as views
 from tangent_train.heads import pictures
 from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
 from tangent_train.heads.classes import exact
-from tangent_train.io.exr import check_exr, write_exr
+from tangent_train.io.exr import write_exr
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
-from tangent_train.io.point_clouds import write_points
 from tangent_train.kinds import Align, DepthKind, depth_channels
 from tangent_train.metrics import depth as metrics
 from tangent_train.metrics.image_sums import Sums, as_sums, means_of_sums
@@ -87,9 +87,6 @@ class DistanceHead(Head):
         points: Largest number of points of an image; None for 500 000.
         **protocol: Further settings of `DepthProtocol`. Pixels beyond its limits are ignored in
             training too.
-
-    Raises:
-        SettingError: A package for the format is missing.
     """
 
     kind: ClassVar[str] = DISTANCE
@@ -139,8 +136,6 @@ class DistanceHead(Head):
         self.scale_invariance, self.align = scale_invariance, align
         self.is_metric = views.is_metric(self.depth_kind)
         suffix = f".{depth_format or 'png'}"
-        if suffix == ".exr":
-            check_exr("depth_format")
         self._units_per_m, self._most = depth_scale, most_depth_m(suffix, depth_scale)
         self._points = 500_000 if points is None else points
         more = {"normals": ".exr", "points": ".ply"}
@@ -298,15 +293,24 @@ class DistanceHead(Head):
             picture = np.rint((normals + 1) * 127.5 * normals.any(axis=-1, keepdims=True))
             write_pixels(files["normals"].with_suffix(".png"), picture.astype(np.uint8))
         if "points" in files:
+            from trimesh import Trimesh  # half a second
+
             pixels = spread_pixels(predicted, self._points)
             points, colors = points_of(predicted, pixels)
-            write_points(files["points"], points, colors, normals[tuple(pixels)])
+            given = {"vertex_normals": normals[tuple(pixels)], "vertex_colors": colors}
+            cloud = Trimesh(points.astype(np.float32), process=False, **given)
+            write_bytes(files["points"], cloud.export(file_type="ply", vertex_normal=True))
 
     def file_kinds(self, write: Sequence[str] | None) -> Sequence[str]:
-        """Return the kinds of output of the setting `write`, see `Head`."""
+        """Return the kinds of output of the setting `write`, see `Head`.
+
+        Raises:
+            SettingError: A package for a format is missing too.
+        """
         kinds = super().file_kinds(write)
-        if "normals" in kinds:
-            check_exr("write")
+        if ".exr" in map(self.suffixes.get, kinds):
+            with of_extra("exr", "write and depth_format"):
+                import OpenEXR  # noqa: F401
         return kinds
 
     def write_source(self, file: Path, pixels: NDArray[Any]) -> None:
@@ -340,16 +344,17 @@ class DistanceHead(Head):
         known, too_far = (
             np.sum(angles, where=mask) / total for mask in (np.isfinite(depth), depth > self._most)
         )
-        facts = {"known": known, "too_far": too_far, **predicted.facts}
+        facts = {**predicted.facts, "known": known, "too_far": too_far}
         summary: dict[str, Any] = {"unit": "m" if self.is_metric else "relative"}
         if known:
             median = np.median(depth[tuple(spread_pixels(predicted, _SAMPLES))])
             facts |= {"nearest": np.nanmin(depth), "median": median, "farthest": np.nanmax(depth)}
             summary["colors"] = [float(f"{limit:.4g}") for limit in pictures.distance_limits(depth)]
-        return summary | {
+        rounded = {
             name: float(f"{value:.4g}") if isinstance(value, float | np.floating) else value
             for name, value in facts.items()
         }
+        return rounded | summary
 
     def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], list[list[str]]]:
         """Return the means of the summaries over the images."""

@@ -136,16 +136,6 @@ def _is_depth(name: str, names: Sequence[str]) -> bool:
     return is_z or (last in ("y", "distance") and len(names) == 1 and not layer)
 
 
-def check_exr(setting: str) -> None:
-    """Refuse a setting that needs the OpenEXR package, before any work.
-
-    Raises:
-        SettingError: The OpenEXR package is missing.
-    """
-    with of_extra("exr", setting):
-        import OpenEXR  # noqa: F401
-
-
 def write_exr(path: Path, pixels: NDArray[Any]) -> None:
     """Write float32 pixels atomically.
 

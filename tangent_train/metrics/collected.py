@@ -50,15 +50,14 @@ class ImagesMetric(Metric):
 class SegmentationMetric(ImagesMetric):
     """Counts the pixels of all images of a data set, see `SegmentationCounts`.
 
-    Pixels are counted as integers. Equirectangular pixels over-count the poles, so each pixel has
-    the weight of its solid angle in the matrix of solid angles. Counts are summed over processes.
+    Pixels are counted as integers, summed over processes. Equirectangular pixels over-count the
+    poles, so that other numbers weight each pixel by its solid angle.
 
     Args:
         num_classes: K + 1, the unknown class 0 included.
     """
 
     pixels: Tensor
-    solid_angle: Tensor
     bands: Tensor
 
     def __init__(self, num_classes: int) -> None:
@@ -69,15 +68,13 @@ class SegmentationMetric(ImagesMetric):
         integers = {"pixels": (k, k), "bands": (len(BAND_EDGES_DEG) - 1, k, k)}
         for name, shape in integers.items():
             self.add_state(name, torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum")
-        zeros = torch.zeros((k, k), dtype=torch.float64)
-        self.add_state("solid_angle", zeros, dist_reduce_fx="sum")
 
     def update(
         self, prediction: Integer[Tensor, "*shape"], truth: Integer[Tensor, "*shape"]
     ) -> None:
         """Count one image, see `count_image`."""
         counts = count_image(prediction, truth, self.num_classes)
-        for name in ("pixels", "solid_angle", "bands"):
+        for name in ("pixels", "bands"):
             setattr(self, name, getattr(self, name) + getattr(counts, name))
         for name in self._shapes:
             getattr(self, name).append(getattr(counts, name))

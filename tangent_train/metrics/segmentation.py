@@ -76,7 +76,6 @@ class SegmentationCounts(NamedTuple):
 
     Attributes:
         pixels: ``(K+1, K+1)`` pixels of panoramas and photos.
-        solid_angle: ``(K+1, K+1)`` steradians of panoramas; all 0 for photos.
         bands: ``(6, K+1, K+1)`` pixels of panoramas in the latitude bands `BAND_EDGES_DEG`.
         of_images: ``(images, 2, 3, K)`` sums from which each image's scores follow, in pixels and
             in steradians: labeled area, predicted area and hits of each class.
@@ -86,7 +85,6 @@ class SegmentationCounts(NamedTuple):
     """
 
     pixels: Any
-    solid_angle: Any
     bands: Any
     of_images: Any
     regions: Any
@@ -125,7 +123,7 @@ def count_image(
         of_regions = [torch.stack(_class_sums(matrix)) for matrix in matrices]
         regions = torch.stack([*of_regions, edges])[None]
     sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
-    counts = pixels, steradians, bands, torch.stack(sums)[None], regions, seam
+    counts = pixels, bands, torch.stack(sums)[None], regions, seam
     return SegmentationCounts(*(part.to(truth.device) for part in counts))
 
 

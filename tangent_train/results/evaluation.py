@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml  # type: ignore[import-untyped]
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from tangent_train.errors import DataError, counted, listed
@@ -340,17 +339,6 @@ def write_image_sums(folder: Path, names: Sequence[str], sums: Sums) -> None:
         arrays: dict[str, Any] = {"images": np.array(names, np.str_), **sums}
         np.savez_compressed(content, **arrays)
         write_bytes(folder / SUMS_FILE, content.getvalue())
-
-
-def read_image_sums(folder: Path) -> tuple[NDArray[np.str_], Sums]:
-    """Read the names of the images of an evaluation, and the numbers of each.
-
-    Raises:
-        OSError: The evaluation has no such file.
-    """
-    with np.load(folder / SUMS_FILE, allow_pickle=False) as file:
-        sums = dict(file)
-    return sums.pop("images"), sums
 
 
 def write_results(

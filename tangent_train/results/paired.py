@@ -10,7 +10,7 @@ import numpy as np
 
 from tangent_train.metrics.image_sums import drawn_scores, intervals, means_of_sums
 from tangent_train.metrics.scores import Interval
-from tangent_train.results.evaluation import SUMS_FILE, EvaluationResult, read_image_sums
+from tangent_train.results.evaluation import SUMS_FILE, EvaluationResult
 
 
 @dataclass(frozen=True)
@@ -39,17 +39,14 @@ def difference(result: EvaluationResult, base: EvaluationResult) -> Difference |
         if result.protocol.get(name) != base.protocol.get(name):
             return f"their {name} differs"
     try:
-        (names, sums), (others, of_base) = (read_image_sums(r.folder) for r in (result, base))
+        files = [dict(np.load(of.folder / SUMS_FILE)) for of in (result, base)]
     except OSError:
         return f"{SUMS_FILE} is missing: evaluate again"
-    common, *places = np.intersect1d(names, others, return_indices=True)
+    common, *places = np.intersect1d(*(sums.pop("images") for sums in files), return_indices=True)
     if not common.size:
         return "no image in common"
-    absent = base.protocol.get("absent_class", "skip")
-    pair = [
-        {name: values[shared] for name, values in of.items()}
-        for of, shared in zip((sums, of_base), places, strict=True)
-    ]
+    absent, shared = base.protocol.get("absent_class", "skip"), zip(files, places, strict=True)
+    pair = [{name: values[of] for name, values in sums.items()} for sums, of in shared]
     means, drawn = ([score(of, absent) for of in pair] for score in (means_of_sums, drawn_scores))
     defined = {name: score for name, score in _minus(*means).items() if not np.isnan(score)}
     return Difference(len(common), defined, intervals(_minus(*drawn)))

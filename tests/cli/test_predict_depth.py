@@ -16,12 +16,14 @@ import trimesh
 from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGB_NORMALIZATION
-from tangent_train.geometry import equirect_directions
+from tangent_train.geometry import PanoramaPose, equirect_directions
 from tangent_train.heads.alignment import AlignedMosaic
+from tangent_train.io.camera_files import write_poses
 from tangent_train.io.pixel_files import read_depth_m, read_pixels, write_pixels
 from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import read_png
 from tests.inference.trained import sphere, write_depth_checkpoint
+from tests.results.box_room import exit_points
 from tests.running import Capture
 
 LEAST_M = 1.5
@@ -35,11 +37,15 @@ def _distances(rgb: NDArray[np.uint8]) -> NDArray[np.float64]:
 @pytest.fixture
 def network(tmp_path: Path) -> Path:
     """A network whose output, the logarithm of the distance, depends on the color of a pixel."""
+    return _network(tmp_path / "depth.ckpt")
+
+
+def _network(path: Path, slope: float = 1) -> Path:
     weight = torch.zeros(1, 3, 3, 3)
-    weight[0, 0, 1, 1] = RGB_NORMALIZATION.std[0]
-    bias = torch.tensor([RGB_NORMALIZATION.mean[0] + math.log(LEAST_M)])
+    weight[0, 0, 1, 1] = slope * RGB_NORMALIZATION.std[0]
+    bias = torch.tensor([slope * RGB_NORMALIZATION.mean[0] + math.log(LEAST_M)])
     tensors = {"weight": weight, "bias": bias}
-    return write_depth_checkpoint(tmp_path / "depth.ckpt", tensors=tensors)
+    return write_depth_checkpoint(path, tensors=tensors)
 
 
 def _depth(path: Path) -> NDArray[np.float64]:
@@ -113,6 +119,60 @@ def test_the_sky_of_a_label_map_has_no_distance(
     unknown = labels == 3
     unknown[53:] = True
     np.testing.assert_array_equal(_depth(tmp_path / "out" / "depth" / "a.png") == 0, unknown)
+
+
+def test_frames_get_one_scale(
+    tmp_path: Path, network: Path, predict: Predict, capsys: Capture
+) -> None:
+    """Brighter pictures of one room are predicted as larger; a folder of one has no neighbor."""
+    rgb, offsets = sphere(64) // 2, {"a": 0, "b": 60, "c": 20}
+    for name, offset in offsets.items():
+        write_pixels(tmp_path / "in" / f"{name}.png", rgb + np.uint8(offset))
+    write_pixels(tmp_path / "in" / "other" / "d.png", rgb)
+    common = {"checkpoint": network, "align_across": "frames", "mask": -60}
+    entries = predict(**common, write="[depth,points]")
+    expected = _distances(rgb + np.uint8(20))  # the median scale stays
+    for name, offset in offsets.items():
+        depth = _depth(tmp_path / "out" / "depth" / f"{name}.png")
+        np.testing.assert_allclose(depth[:53], expected[:53], rtol=0.02)
+        assert not depth[53:].any()
+        assert entries[name]["depth"]["scale"] == pytest.approx(
+            math.exp((20 - offset) / 255), rel=0.01
+        )
+        assert entries[name]["depth"]["median"] == pytest.approx(np.median(depth), rel=0.05)
+        assert entries[name]["depth"]["step_after"] < 0.01
+        points = trimesh.load(tmp_path / "out" / "points" / f"{name}.ply").vertices
+        farthest = np.linalg.norm(points, axis=-1).max()
+        assert farthest == pytest.approx(entries[name]["depth"]["farthest"], rel=1e-3)
+    assert entries["other/d"]["depth"]["scale"] == 1
+    printed = capsys.readouterr().out
+    assert "One scale for 3 images" in printed
+    assert "Nothing determines the scale of other/d" in printed
+    # A further image changes the scales of all.
+    write_pixels(tmp_path / "in" / "e.png", rgb + np.uint8(60))
+    write_pixels(tmp_path / "in" / "f.png", rgb + np.uint8(60))
+    assert predict(**common, write="[depth,points]")["a"]["depth"]["scale"] == pytest.approx(
+        math.exp(60 / 255), rel=0.01
+    )
+
+
+def test_known_poses_give_their_unit(tmp_path: Path, predict: Predict) -> None:
+    """A box that the network estimates 1.6 times too large, from two places in it."""
+    poses = {
+        f"{name}.png": PanoramaPose(np.diag([1.0, -1, 1]), location)
+        for name, location in (("a", (0.5, 0.2, 0)), ("b", (-0.4, -0.2, 0.1)))
+    }
+    for name, pose in poses.items():
+        rays = equirect_directions((128, 256)) @ pose.world_from_panorama.T
+        distance = np.linalg.norm(exit_points(pose.location_m, rays) - pose.location_m, axis=-1)
+        red = 255 / 2 * np.log(distance * 1.6 / LEAST_M)
+        rgb = np.repeat(red.round().clip(0, 255)[..., None], 3, axis=-1)
+        write_pixels(tmp_path / "in" / name, rgb.astype(np.uint8))
+    write_poses(tmp_path / "poses.json", poses)
+    given = {"align_across": tmp_path / "poses.json", "levels": 7, "write": "[depth]"}
+    entries = predict(checkpoint=_network(tmp_path / "depth.ckpt", 2), **given)
+    scales = [entries[name]["depth"]["scale"] for name in "ab"]
+    np.testing.assert_allclose(scales, 1 / 1.6, rtol=0.05)
 
 
 def test_views_are_aligned_while_the_next_image_is_predicted(

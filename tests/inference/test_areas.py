@@ -104,9 +104,11 @@ def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotat
             labels.append(predicted.where(batch.labels[0] > 0, 0))
             views.append(batch.images.numel())
         counts.append(metric.compute())
-    for name in ("pixels", "bands", "solid_angle"):  # true classes, which the fill does not change
+    for name in ("pixels", "bands"):  # true classes, which the fill does not change
         expected, found = (getattr(count, name).sum(axis=-1) for count in counts)
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        np.testing.assert_array_equal(found, expected)
+    expected, found = (count.of_images[:, 1, 0] for count in counts)  # by solid angle
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
     assert counts[0].pixels.sum() > 0
     before, after = torch.stack(labels[:2]), torch.stack(labels[2:])
     assert (before == after)[before > 0].double().mean() > 0.98

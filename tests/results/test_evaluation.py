@@ -42,7 +42,7 @@ def _matrices(pixels: dict[tuple[int, int], int] | None = None) -> SegmentationC
     bands[2] = erp
     sums = np.stack([erp[1:].sum(axis=1), erp[:, 1:].sum(axis=0), erp.diagonal()[1:]])
     of_one_image = np.stack([sums, sums / 10])[None], np.zeros((1, 5, 3, 3)), np.zeros((1, 6))
-    return SegmentationCounts(erp, erp / 10, bands, *of_one_image)
+    return SegmentationCounts(erp, bands, *of_one_image)
 
 
 def _record(
@@ -111,7 +111,6 @@ def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
     halves = np.concatenate([counts.of_images] * 2) / 2 * [[[[1]], [[0]]]]
     of_photos = SegmentationCounts(
         counts.pixels,
-        np.zeros((4, 4)),
         np.zeros((6, 4, 4), np.int64),
         halves,
         counts.regions[:0],
