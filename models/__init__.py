@@ -18,6 +18,7 @@ from models.mapped import mapped_samples as mapped_samples
 from models.mapped import mesh_operators as mesh_operators
 from models.pretrained import initialize as initialize
 from models.pretrained import widen_stem as widen_stem
+from models.prompted import PromptedNetwork as PromptedNetwork
 from models.shape_classifier import ShapeClassifier as ShapeClassifier
 from models.sphere_attention import SphereAttention as SphereAttention
 from models.spherical_cnn import SphericalCNN as SphericalCNN

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from models.segments import Segments
 from models.unet import check_size
 from tangent_train.errors import SettingError, of_extra
 
@@ -143,6 +144,14 @@ class _TransformersNetwork(nn.Module):
         return images
 
 
+def image_processor_class(config: Any) -> Any:
+    """Return the usual image processor of the networks of a config of transformers."""
+    from transformers import IMAGE_PROCESSOR_MAPPING
+
+    kinds: Any = IMAGE_PROCESSOR_MAPPING[type(config)]
+    return kinds.get("torchvision") or kinds["pil"]
+
+
 def network_types(task: str) -> set[str]:
     """Return the ``model_type`` of all networks that transformers has for a task.
 
@@ -161,7 +170,8 @@ class HuggingFaceNetwork(_TransformersNetwork):
         config: `architecture` of the network, with ``model_type``.
         num_classes: Number of scores K of a pixel.
         bgr: True if the network takes BGR images, e.g. MobileViT.
-        task: Tokens of "the task is semantic", an additional input of OneFormer.
+        task: Tokens of "the task is semantic", or "panoptic" for objects, an input of OneFormer.
+        things: Indices of the classes of which a universal network also returns objects.
 
     Attributes:
         network: The network of transformers.
@@ -177,17 +187,19 @@ class HuggingFaceNetwork(_TransformersNetwork):
         num_classes: int,
         bgr: bool = False,
         task: Sequence[int] | None = None,
+        things: Sequence[int] = (),
     ) -> None:
         super().__init__(config, SEGMENTATION, bgr, num_labels=num_classes)
         self.is_universal = config["model_type"] not in network_types(SEGMENTATION[0])
+        self._stuff = set(range(num_classes)) - set(things) if things else None
         tokens = None if task is None else torch.tensor([list(task)])
         self._task: Tensor | None
         self.register_buffer("_task", tokens, persistent=False)
 
-    def forward(
-        self, images: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch classes height width"]:
-        """Return scores of every pixel of the images.
+    def forward(self, images: Float[Tensor, "batch channels height width"]) -> Any:
+        """Return scores ``(batch, classes, height, width)`` of the images.
+
+        With objects, scores and a list of `Segments` are a dict, ``out`` and ``segments``.
 
         Networks for universal segmentation return masks with classes. Scores are the logarithms of
         the share of each class, so that a softmax returns shares, also for sums of classes.
@@ -199,6 +211,7 @@ class HuggingFaceNetwork(_TransformersNetwork):
         size = (images.shape[-2], images.shape[-1])
         task = {} if self._task is None else {"task_inputs": self._task.expand(len(images), -1)}
         returned = self.network(pixel_values=images, **task)
+        segments = [] if self._stuff is None else self._segments(returned, size)
         masks = returned.get("masks_queries_logits", returned.get("pred_masks"))
         if masks is None:
             return functional.interpolate(returned["logits"], size, mode="bilinear")
@@ -210,7 +223,30 @@ class HuggingFaceNetwork(_TransformersNetwork):
         of_masks = classes.float().softmax(-1)[..., :-1]
         scores = torch.einsum("bqc,bqhw->bchw", of_masks, masks.float().sigmoid())
         scores = functional.interpolate(scores, size, mode="bilinear")
-        return scores.clamp_min(torch.finfo(scores.dtype).tiny).log()
+        scores = scores.clamp_min(torch.finfo(scores.dtype).tiny).log()
+        return {"out": scores, "segments": segments} if self._stuff is not None else scores
+
+    def _segments(self, returned: Any, size: tuple[int, int]) -> list[Segments]:
+        """Return the library's panoptic segmentation of each image."""
+        made = self.network.config
+        named: dict[str, Any] = {"label_ids_to_fuse": self._stuff}
+        if made.model_type.startswith("eomt"):
+            sides = {"shortest_edge": size[0], "longest_edge": size[1]}
+            named, returned["patch_offsets"] = {"stuff_classes": self._stuff, "size": sides}, None
+        process = image_processor_class(made)().post_process_panoptic_segmentation
+        found = process(returned, target_sizes=[size] * len(returned[0]), **named)
+        return [_segments_of(each["segmentation"], each["segments_info"]) for each in found]
+
+
+def _segments_of(numbers: Tensor, infos: Sequence[Mapping[str, Any]]) -> Segments:
+    """Return the library's segments of one image as objects."""
+    given = [torch.tensor([info[key] for info in infos]) for key in ("id", "label_id", "score")]
+    ids, classes, scores = (values.to(numbers.device) for values in given)
+    is_segment = numbers[None] == ids[:, None, None]
+    order = torch.arange(1, len(infos) + 1, dtype=torch.int32, device=numbers.device)
+    return Segments(
+        (is_segment * order[:, None, None]).sum(0).int(), classes.long(), scores.float()
+    )
 
 
 _BILINEAR = ("depth_pro", "tipsv2_dpt")

@@ -10,23 +10,32 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from datamodules.core.files import Problems
 from datamodules.zind.homes import list_home_panoramas
-from studies.output import Row, save
+from studies.output import FOLDER, Row, save
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import DataError
+from tangent_train.files import write_bytes
 from tangent_train.geometry import equirect_latitudes
 from tangent_train.geometry.camera import half_width
+from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
-from tangent_train.inference.engine import RenderedViews
+from tangent_train.heads.pictures import (
+    colorize_distance,
+    distance_limits,
+    with_distance_legend,
+)
+from tangent_train.inference.engine import Predictor, RenderedViews
 from tangent_train.inference.images import InputImage, read_panorama
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.pixel_files import read_depth_m, read_rgb
@@ -43,6 +52,9 @@ _SHAPE = 512, 1024
 """Rows and columns of all panoramas."""
 
 _MODES: tuple[Align, ...] = "none", "scale", "grid"
+_PICTURED = 12
+"""Number of the panorama in the picture."""
+
 _CAMERAS = "ignored", "used"
 _UNALIGNED = "equirectangular image", "six cube faces"
 """Views without overlap, of which all corrections are equal."""
@@ -53,6 +65,24 @@ _WITH_GRID = (
     "views like the photos",
 )
 """Views with the correction `grid`, which takes long, on rooms."""
+
+_BANDS = [f"{low:g}° to {high:g}°" for low, high in pairwise(BAND_EDGES_DEG)]
+_COLUMNS: dict[str, tuple[str, float, int]] = {
+    "absrel": ("AbsRel", 1, 3),
+    "delta1": ("δ1 %", 100, 1),
+    "rmse": ("RMSE m", 1, 2),
+    "absrel, median": ("AbsRel with the right median", 1, 3),
+    "delta1, median": ("δ1 % with the right median", 100, 1),
+    "rmse, median": ("RMSE m with the right median", 1, 2),
+    "step_before": ("step before %", 100, 1),
+    "step_after": ("step after %", 100, 1),
+    **{band: (f"AbsRel with the right median, {band}", 1, 3) for band in _BANDS},
+}
+"""Title, factor and digits of the scores."""
+
+_WITH_INTERVAL = "absrel", "delta1", "absrel, median", "delta1, median"
+_MANY = 10
+"""Number of panoramas from which intervals are printed."""
 
 
 class Panorama(NamedTuple):
@@ -106,8 +136,8 @@ def view_options(loaded: LoadedNetwork) -> dict[str, dict[str, Any]]:
         "80 tangent images (b = 1)": {"views": "tangent", "base_level": 1, "levels": level},
         "16 horizontal views, 130° and 100°": {"views": "horizontal_wide"},
         "18 horizontal views of 100°": {"views": "horizontal"},
+        "views like the photos": {"views": "horizontal_camera"},
     }
-    found["views like the photos"] = {"views": "horizontal_camera"}
     for across in (80.0, 100.0):  # stretched as the photos were
         ratio = half_width(fov_deg[1]) / half_width(fov_deg[0])
         down = 2 * math.degrees(math.atan(half_width(across) * ratio))
@@ -127,9 +157,7 @@ def scores(prediction: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
             row[key + name] = float(of_sphere[key])
         if name:
             bands = depth_scores(sums[BANDS])["absrel"]
-            edges = pairwise(BAND_EDGES_DEG)
-            for (low, high), value in zip(edges, bands, strict=True):
-                row[f"absrel, median, {low:g}° to {high:g}°"] = float(value)
+            row |= dict(zip(_BANDS, bands.tolist(), strict=True))
     return row
 
 
@@ -196,34 +224,63 @@ def scales(ratios: Sequence[Row]) -> list[Row]:
     for key in sorted({tuple(row.values())[:3] for row in ratios}):
         of_key = [row["ratio"] for row in ratios if tuple(row.values())[:3] == key]
         row = dict(zip(("data", "views", "pitch °"), key, strict=True))
-        row |= {"number": len(of_key), "scale": float(np.mean(of_key))}
-        rows.append(row | {"spread": float(np.std(of_key))})
+        row |= {"number": len(of_key), "scale": f"{np.mean(of_key):.2f}"}
+        rows.append(row | {"spread": f"{np.std(of_key):.2f}"})
     return rows
 
 
-def means(rows: Sequence[Row], seed: int = 0) -> list[Row]:
-    """Return means over panoramas, and 95 % bootstrap intervals of three scores."""
-    keys = list(dict.fromkeys(tuple(row.values())[:4] for row in rows))
+def table(rows: Sequence[Row], seed: int = 0) -> list[Row]:
+    """Return the means over the panoramas of each group, as texts.
+
+    Args:
+        rows: Results of `measure`.
+        seed: Seed of the 95 % bootstrap intervals over the panoramas of a large group.
+    """
     rng, found = np.random.default_rng(seed), []
-    for key in keys:
-        of_key = [row for row in rows if tuple(row.values())[:4] == key]
-        table: NDArray[np.float64] = np.array(
-            [[np.nan if v is None else v for v in list(row.values())[4:]] for row in of_key], float
-        )
-        names = list(of_key[0])[4:]
-        row: Row = {"data": key[0], "panoramas": len(of_key)}
-        row |= dict(zip(("views", "camera", "align"), key[1:], strict=True))
-        for name, values in zip(names, table.T, strict=True):
-            known = values[~np.isnan(values)]
-            row[name] = float(known.mean()) if len(known) else ""
-            if name in ("absrel", "delta1", "delta1, median") and len(known) > 9:
-                draws = rng.choice(known, (2000, len(known))).mean(axis=1)
+    groups = list(dict.fromkeys(row["data"] for row in rows))
+    for key in dict.fromkeys(tuple(row.values())[1:4] for row in rows):
+        of_key = [row for row in rows if tuple(row.values())[1:4] == key]
+        line: Row = {"views": key[0], "number": int(of_key[0]["number"])}
+        line |= {"camera": key[1], "align": key[2]}
+        for group, (score, (title, scale, digits)) in product(groups, _COLUMNS.items()):
+            found_in = [row[score] for row in of_key if row["data"] == group]
+            values = scale * np.array([np.nan if v is None else v for v in found_in], float)
+            values = values[~np.isnan(values)]
+            text = f"{values.mean():.{digits}f}" if len(values) else ""
+            if len(values) >= _MANY and score in _WITH_INTERVAL:
+                draws = rng.choice(values, (2000, len(values))).mean(axis=1)
                 low, high = np.quantile(draws, (0.025, 0.975))
-                row[f"{name} from"], row[f"{name} to"] = float(low), float(high)
-            elif name in ("absrel", "delta1", "delta1, median"):
-                row[f"{name} from"] = row[f"{name} to"] = ""
-        found.append(row)
+                text += f" [{low:.{digits}f}, {high:.{digits}f}]"
+            line[f"{title}, {group}"] = text
+        found.append(line)
     return found
+
+
+def picture(loaded: LoadedNetwork, panorama: Panorama, given: Mapping[str, Any]) -> NDArray[Any]:
+    """Draw a panorama, its known distances, and those of the network, as RGB.
+
+    Args:
+        loaded: The network, whose camera is known.
+        panorama: The panorama.
+        given: Arguments of `ViewSelector`.
+    """
+    tiles = {"panorama": panorama.image.rgb}
+    known = panorama.distance_m.numpy()
+    limits = distance_limits(known)
+    tiles["room layout"] = colorize_distance(known, limits)
+    for title, kind in (("camera ignored", "metric_z"), ("camera used", "canonical_z")):
+        of_kind: Any = replace(loaded, depth_kind=kind)
+        predictor = Predictor(of_kind, head_of(of_kind), ViewSelector(of_kind, **given))
+        found = predictor.predict(panorama.image).pixels().numpy()
+        tiles[title] = colorize_distance(found, limits)
+    parts = []
+    for title, tile in tiles.items():
+        small = resize(tile, (256, 512), "bilinear")
+        strip = np.full((28, 512, 3), 255, np.uint8)
+        cv2.putText(strip, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
+        parts.append(np.concatenate([strip, small]))
+    rows = [np.concatenate(parts[k : k + 2], axis=1) for k in (0, 2)]
+    return with_distance_legend(np.concatenate(rows), limits, "m")
 
 
 def main() -> None:
@@ -240,8 +297,12 @@ def main() -> None:
     for name, options in view_options(loaded).items():
         of_name = measure(loaded, panoramas, name, options)
         found, ratios = found + of_name[0], ratios + of_name[1]
-    save("depth_network", means(found), digits=3)
-    save("depth_network_scales", scales(ratios), digits=3)
+    of_homes = [panorama for panorama in panoramas if panorama.group != "rooms"]
+    if of_homes:
+        drawn = picture(loaded, of_homes[_PICTURED], {"views": "horizontal"})
+        write_bytes(FOLDER / "depth_network.jpg", cv2.imencode(".jpg", drawn[..., ::-1])[1])
+    save("depth_network", table(found))
+    save("depth_network_scales", scales(ratios))
 
 
 if __name__ == "__main__":

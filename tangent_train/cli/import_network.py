@@ -28,7 +28,7 @@ _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "log_distance": "the logarithm of the distance in meters",
     "metric_distance": "the distance along each ray in meters",
     "metric_z": "z-depth in meters",
-    "canonical_z": "z-depth in meters of one camera, multiplied by the focal length of a view",
+    "canonical_z": "z-depth in meters of one camera; that of a view follows its focal length",
     "canonical_inverse": "1 / z-depth in meters, times the focal length of a view in widths",
     "relative_z": "z-depth up to a scale of each view",
     "relative_depth": "z-depth up to a scale and a shift of each view",
@@ -93,7 +93,8 @@ def _load(settings: ImportSettings) -> PhotoNetwork:
         expected = f"a value, for library={settings.library or 'null'}"
         raise SettingError(needed, found="null", expected=expected)
     network = load(**given)
-    read = _READ | given.keys()
+    unread = {"threshold"} if settings.prompts is None else {"classes", "depth", "things"}
+    read = (_READ | given.keys()) - unread
     check_read(settings, (read | _OF_CLASSES) if network.depth_kind is None else read - {"classes"})
     return network
 
@@ -126,6 +127,7 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
         [
             f"{path}: {path.stat().st_size / 1e6:.1f} MB",
             f"{len(names)} classes: {listed(names)}" if kind is None else f"depth: {kind}",
+            *[f"objects of: {listed(trained.things)}"] * bool(trained.things),
             *[unknown] * bool(settings.unknown_classes),
             f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
             f"normalization of images from 0 to 1: mean {mean}, std {std}",

@@ -333,6 +333,14 @@ class ImportSettings(Settings):
     unknown_wins: bool = True
     """pixels whose best class is one of unknown_classes: true = unknown (label 0) | false = the
     best other class"""
+    prompts: dict[str, OneOrMore[str]] | OneOrMore[str] | None = None
+    """texts that name the classes, for CLIPSeg and SAM 3 of huggingface: [chair,"picture frame"] |
+    {seating: [chair, sofa], window: window} | a file with a text per line"""
+    threshold: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    """with prompts: probability that a class must exceed; elsewhere pixels are unknown"""
+    things: OneOrMore[str] = ()
+    """classes of which the network also returns objects, e.g. [chair,table], or all; for universal
+    networks of huggingface"""
 
     # --- photos and views ---
     normalization: str | dict[str, tuple[float, ...]] | None = None
@@ -487,14 +495,6 @@ class TrainSettings(RunSettings):
 class FilesSettings(RunSettings):
     """Settings of commands that read predictions of any program."""
 
-    # --- consistency ---
-    consistency: NonNegativeInt = 0
-    """panoramas: compare predictions for this number of turns about the vertical, and for as many
-    random rotations, with the first prediction; 0 = none (8 with input=)"""
-    input: str | Path | None = None
-    """only consistency, of panoramas without labels, instead of data=: panorama or video, folder of
-    them, or pattern, e.g. 'holiday/*.jpg'"""
-
     # --- predictions of any program ---
     predictions: ExistingPath | None = None
     """folder of predictions of any program, which are scored instead of a network: label maps,
@@ -531,6 +531,14 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
     checkpoint: ExistingPath | None = None  # type: ignore[assignment]
     """network file, written by tangent-train, tangent-import or tangent-export; required without
     predictions="""
+
+    # --- consistency ---
+    consistency: NonNegativeInt = 0
+    """panoramas: compare predictions for this number of turns about the vertical, and for as many
+    random rotations, with the first prediction; 0 = none (8 with input=)"""
+    input: str | Path | None = None
+    """only consistency, of panoramas without labels, instead of data=: panorama or video, folder of
+    them, or pattern, e.g. 'holiday/*.jpg'"""
 
     # --- views ---
     representation: Section | None = None  # type: ignore[assignment]

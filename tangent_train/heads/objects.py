@@ -37,8 +37,9 @@ from tangent_train.rendering.representations.views import PinholeViews, Views
 Numbers = NDArray[np.int32]
 Matrix = Floats | None
 
-LEAST_OVERLAP = 0.5
-"""Intersection over union, at the directions that two views see, from which masks join."""
+LEAST_OVERLAP = 0.3
+"""Intersection over union, at the directions that two views see, from which masks join; measured
+in docs/explanation/objects.md."""
 
 _ROWS = 512
 """Rows of the canvas on which masks are compared, at most."""
@@ -248,7 +249,8 @@ def described(
     entries = []
     for k, part in enumerate(np.split(pixels, ends[:-1])[:count]):
         center, extent = _box(_directions(part, numbers.shape, camera_matrix))
-        extent = extent + math.pi / numbers.shape[0]  # between outer edges of pixels
+        # Between outer edges of pixels.
+        extent = np.minimum(extent + math.pi / numbers.shape[0], (2 * math.pi, math.pi))
         entries.append(
             {
                 "number": k + 1,

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch.utils._pytree import tree_map_only
 
 from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import STEPS_PER_M, resize_depth
@@ -275,10 +276,9 @@ class Predictor:
             return network
         compiled: Any = torch.compile(network, **self._compile)
         # The next call of a CUDA graph overwrites the output of the last.
-        return lambda *given, **named: {
-            name: output.clone()
-            for name, output in named_outputs(compiled(*given, **named)).items()
-        }
+        return lambda *given, **named: tree_map_only(
+            torch.Tensor, torch.clone, dict(named_outputs(compiled(*given, **named)))
+        )
 
     @torch.no_grad()
     def predict(

@@ -5,16 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.inputs import Normalization
-from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
+from datamodules.core.label_map import UNKNOWN_NAME
+from models.huggingface import (
+    DEPTH,
+    SEGMENTATION,
+    architecture,
+    image_processor_class,
+    network_types,
+)
+from models.prompted import text_network, without_layers, without_text
 from tangent_train.config.from_file import build_from_file
-from tangent_train.errors import DataError, SettingError, first_line
+from tangent_train.errors import DataError, SettingError, first_line, listed
 from tangent_train.files import read_json
 from tangent_train.imports import hide_output, offline
 from tangent_train.kinds import DepthKind
@@ -27,8 +37,11 @@ from tangent_train.photo_networks.network import (
     tensors_in,
 )
 
+Prompts = Mapping[str, Sequence[str]] | Sequence[str] | None
+"""Texts that name classes, see `prompted`."""
+
 _NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
-_TASK = "the task is semantic"
+_TASK = "the task is "
 _LEFT_OUT = ("use_auxiliary_head", "use_fov_model")
 """Parts of networks that are not used: a head for training, and the field of view of Depth Pro,
 which is known here."""
@@ -65,6 +78,9 @@ _NOT_OF_COLORS = ("do_resize", "do_center_crop", "do_pad", "do_split_image")
 _MOST_PIXELS = 2**26
 """Largest image size of an image processor that is tried."""
 
+_ALL = "all"
+"""Setting `things`: all classes have objects."""
+
 _LISTED = 4
 """Largest number of wrong tensors in a message."""
 
@@ -74,6 +90,9 @@ def load(
     classes: Path | None = None,
     normalization: Any = None,
     depth: DepthKind | None = None,
+    things: Sequence[str] = (),
+    prompts: Prompts = None,
+    threshold: float = 0.5,
 ) -> PhotoNetwork:
     """Load a network of transformers for semantic or universal segmentation, or for depth.
 
@@ -84,14 +103,20 @@ def load(
         classes: JSON file of the class names; None for the names in the model's config.
         normalization: See `Normalization.of`; None for that of the model's image processor.
         depth: Kind of depth; None for that of the model's config.
+        things: Names of the classes of which a universal network also returns objects; or "all".
+        prompts: See `prompted`.
+        threshold: See `prompted`.
 
     Raises:
         DataError: A file is missing, or cannot be fetched or used.
-        SettingError: The kind of depth is unknown, or transformers is not installed.
+        SettingError: There are no such classes, or no objects; the kind of depth is unknown; or
+            transformers is not installed.
     """
     folder = saved_folder(model)
     path = folder / "config.json"
     config = read_json(path, "the config of a model")
+    if prompts is not None:
+        return prompted(folder, config, prompts, threshold, normalization)
     with offline():
         described = architecture(config | dict.fromkeys(_LEFT_OUT, False))
         processor = _processor(folder, described["model_type"])
@@ -107,8 +132,12 @@ def load(
             labels = {index: str(name).strip() for index, name in labels.items()}
             names = names_of(labels, path, _NAMES)
             settings |= {"_target_": "models.HuggingFaceNetwork", "num_classes": len(names)}
+        given_names = names if classes is None else class_names_in(classes)
+        if things:
+            things = given_names if list(things) == [_ALL] else things
+            settings["things"] = _indices(things, given_names, described["model_type"])
         if described["model_type"] == "oneformer":
-            settings["task"] = _task(folder, config)
+            settings["task"] = _task(folder, config, "panoptic" if things else "semantic")
         network = build_from_file(settings, "network", path)
         _load_tensors(network, tensors_in(folder), folder)
     settings["config"] = architecture(network.network.config.to_dict())
@@ -116,12 +145,98 @@ def load(
     return PhotoNetwork(
         module=network,
         settings=settings,
-        score_names=names if classes is None else class_names_in(classes),
+        score_names=given_names,
         normalization=given or Normalization(processor["mean"], processor["std"]),
         image_size=_image_size(processor, folder / "preprocessor_config.json"),
         score_kind="logits",
         depth_kind=kind,
+        things=things,
     )
+
+
+def prompted(
+    folder: Path, config: Any, prompts: Prompts, threshold: float, normalization: Any
+) -> PhotoNetwork:
+    """Load a network that finds what a text names, with the texts as classes.
+
+    Args:
+        folder: Folder of the model with its tokenizer.
+        config: Content of its config.
+        prompts: Texts, which are the names of the classes; texts of each class by its name; or a
+            file with a text per line.
+        threshold: Probability that a class must exceed; elsewhere pixels are unknown.
+        normalization: See `load`.
+    """
+    if not isinstance(prompts, Mapping):
+        names = tuple(prompts or ())
+        if len(names) == 1 and Path(names[0]).is_file():
+            lines = Path(names[0]).read_text(encoding="utf-8").splitlines()
+            names = tuple(filter(None, map(str.strip, lines)))
+        prompts = {name: [name] for name in names}
+    names, texts = tuple(prompts), list(prompts.values())
+    config = config.get("detector_config") or config  # SAM 3 is published with its tracker
+    with offline():
+        described = architecture(config)
+        processor = _processor(folder, described["model_type"])
+        whole = text_network(described).eval()
+        _load_tensors(SimpleNamespace(network=whole), tensors_in(folder), folder)
+        embeddings, is_token = _embedded(whole, folder, [text for of in texts for text in of])
+        settings = {
+            "_target_": "models.PromptedNetwork",
+            "config": without_layers(described),
+            "class_of_prompt": [k for k, of in enumerate(texts) for _ in of],
+            "num_tokens": is_token.shape[1],
+            "threshold": threshold,
+        }
+        network: Any = build_from_file(settings, "network", folder / "config.json")
+    network.network.load_state_dict(without_text(whole).state_dict())
+    network.embeddings.copy_(embeddings)
+    network.is_token.copy_(is_token)
+    given = None if normalization is None else Normalization.of(normalization, 3)
+    return PhotoNetwork(
+        module=network,
+        settings=settings,
+        score_names=(*names, UNKNOWN_NAME),
+        normalization=given or Normalization(processor["mean"], processor["std"]),
+        image_size=network.fixed_size,
+        score_kind="logits",
+        things=names if described["model_type"] == "sam3" else (),
+        unknown=(UNKNOWN_NAME,),
+    )
+
+
+@torch.no_grad()
+def _embedded(whole: Any, folder: Path, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Return the embeddings of texts, and which of their tokens are not padding."""
+    if not texts:
+        raise SettingError("prompts", found="none", expected="a text for each class")
+    tokenizer = _tokenizer(folder, "a text")
+    length = whole.config.text_config.max_position_embeddings
+    how = {"padding": "max_length", "max_length": length, "truncation": True}
+    tokens = tokenizer(list(texts), return_tensors="pt", **how)
+    given = {name: tokens[name] for name in ("input_ids", "attention_mask")}
+    if whole.config.model_type == "clipseg":
+        return whole.get_conditional_embeddings(len(texts), **given), torch.ones(len(texts), 0) > 0
+    return whole.get_text_features(**given).pooler_output, tokens["attention_mask"] > 0
+
+
+def _tokenizer(folder: Path, reason: str) -> Any:
+    """Return the tokenizer of a model."""
+    from transformers import AutoTokenizer
+
+    if not any((folder / name).is_file() for name in _VOCABULARIES):  # else tokens are "unknown"
+        expected = f"the tokenizer of the network, which takes {reason}"
+        raise DataError(folder, found=f"no {' or '.join(_VOCABULARIES)}", expected=expected)
+    return AutoTokenizer.from_pretrained(folder, local_files_only=True, trust_remote_code=False)
+
+
+def _indices(things: Sequence[str], names: Sequence[str], model_type: str) -> list[int]:
+    """Return the indices of classes that have objects."""
+    is_universal = model_type in network_types(SEGMENTATION[1])
+    if not (is_universal and set(things) <= set(names)):
+        expected = f"among {listed(names)}" if is_universal else f"null, for {model_type}"
+        raise SettingError("things", found=listed(things), expected=expected)
+    return [names.index(name) for name in things]
 
 
 def _predicts_depth(config: Mapping[str, Any], path: Path, depth: DepthKind | None) -> bool:
@@ -209,15 +324,14 @@ def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[A
 def _processor_class(content: Mapping[str, Any], model_type: str) -> Any:
     """Return the class named in a file, also by its older name, or the network's default."""
     import transformers  # loads its classes on demand
-    from transformers import IMAGE_PROCESSOR_MAPPING, AutoConfig
+    from transformers import AutoConfig
     from transformers.image_processing_utils import BaseImageProcessor
 
     older = str(content.get("feature_extractor_type", "")).replace("Feature", "Image")
     name = str(content.get("image_processor_type") or older.replace("Extractor", "Processor"))
     kind = getattr(transformers, name.removesuffix("Fast"), None)
     if not (isinstance(kind, type) and issubclass(kind, BaseImageProcessor)):
-        kinds: Any = IMAGE_PROCESSOR_MAPPING[type(AutoConfig.for_model(model_type))]
-        kind = kinds.get("torchvision") or kinds["pil"]
+        kind = image_processor_class(AutoConfig.for_model(model_type))
     return kind
 
 
@@ -236,18 +350,11 @@ def _image_size(processor: Mapping[str, Any], path: Path) -> tuple[int, int]:
     return size
 
 
-def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
-    """Return the tokens that select OneFormer's semantic task (``OneFormerProcessor``)."""
-    from transformers import AutoTokenizer
-
-    if not any((folder / name).is_file() for name in _VOCABULARIES):  # else tokens are "unknown"
-        expected = "the tokenizer of OneFormer, which takes its task as text"
-        raise DataError(folder, found=f"no {' or '.join(_VOCABULARIES)}", expected=expected)
-    tokenizer = AutoTokenizer.from_pretrained(
-        folder, local_files_only=True, trust_remote_code=False
-    )
+def _task(folder: Path, config: Mapping[str, Any], task: str) -> list[int]:
+    """Return the tokens that select one of OneFormer's tasks (``OneFormerProcessor``)."""
+    tokenizer = _tokenizer(folder, "its task as text")
     length = config.get("task_seq_len", 77)
-    text = tokenizer(_TASK, padding="max_length", max_length=length, truncation=True)
+    text = tokenizer(_TASK + task, padding="max_length", max_length=length, truncation=True)
     masked = zip(text["input_ids"], text["attention_mask"], strict=True)
     return [token * mask for token, mask in masked]
 

@@ -96,13 +96,17 @@ def import_network(
     """
     multiple, only_size = declared_sizes(network.module)
     fixed = image_size or only_size
+    if network.things and fixed and fixed[0] != fixed[1]:
+        found = f"{width_height(fixed)}, and objects"
+        raise SettingError("image_size", found=found, expected="a square, which views are")
     size = fixed or network.image_size
     output = _output(network, size)
     described: dict[str, Any] = {"class_names": (), "predicts": DISTANCE}
     if network.depth_kind is None:
         kind = score_kind or network.score_kind or usual_kind(output, len(network.score_names))
         count = output.shape[1]
-        names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
+        unknown = {*unknown_classes, *network.unknown}
+        names, groups = _groups(network.score_names, kind, count, unknown, unknown_wins)
         things = tuple(name for name in map(composed, network.things) if name in names)
         described = {"class_names": names, "groups": groups, "score_kind": kind, "things": things}
     camera = None if fov_deg is None else _both_fov_deg(fov_deg, size)

@@ -34,6 +34,7 @@ class PhotoNetwork:
         score_kind: Kind of the network's output if its library declares it, see `usual_kind`.
         depth_kind: Kind of depth that the network predicts; None for classes.
         things: Names of the scores of which the network also returns objects, see `Segments`.
+        unknown: Names of scores that are not classes.
     """
 
     module: nn.Module
@@ -44,6 +45,7 @@ class PhotoNetwork:
     score_kind: ScoreKind | None = None
     depth_kind: DepthKind | None = None
     things: Sequence[str] = ()
+    unknown: Sequence[str] = ()
 
 
 _WEIGHTS = "model.safetensors"

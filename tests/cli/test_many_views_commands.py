@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from tangent_train.inference.export import export_network
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tangent_train.photo_networks import PhotoNetwork, import_network
 from tests.cli.tiny_runs import Predict, Run
+from tests.datamodules.folder.folder_format import write_data_set
 from tests.inference.test_many_views import UNIT
 from tests.inference.trained import sphere
 from tests.running import Capture
@@ -53,6 +55,11 @@ def test_imported_networks_predict_evaluate_and_are_exported(
     assert "error of the network's own rotations, °" in capsys.readouterr().out
     depth = read_depth_m(tmp_path / "out" / "depth" / "hall.png", 1000)
     np.testing.assert_allclose(depth, 1.5 + sphere(64)[..., 0] / 255, atol=0.05)
+    write_data_set(tmp_path / "rooms", each=1, height=64, depth=True)
+    data = "data=folder", "task=depth", f"data.root={tmp_path / 'rooms'}", "data.inputs=[rgb]"
+    run("evaluate", f"checkpoint={path}", *data, GIVEN, "hydra.run.dir=scores")
+    record = json.loads((tmp_path / "scores" / "results.json").read_text())
+    assert 0 < record["scores"]["absrel"] < 10
     run("export", f"checkpoint={path}", f"output={tmp_path / 'net.safetensors'}", GIVEN)
     again = load_network(tmp_path / "net.safetensors", [f"{__name__}.Bright"])
     assert again.network.takes_cameras

@@ -158,15 +158,21 @@ def imported(folder: Path, **settings: Any) -> LoadedNetwork:
     return import_network(network, folder / "imported.ckpt")
 
 
-@torch.no_grad()
-def imported_scores(trained: LoadedNetwork) -> Tensor:
-    """Return scores ``(K, h, w)`` of the imported network for the photo."""
+def normalized(trained: LoadedNetwork) -> Tensor:
+    """Return the photo as an image of the imported network, ``(1, 3, h, w)``."""
     rgb = torch.from_numpy(photo()).permute(2, 0, 1) / 255
     mean, std = (
         torch.tensor(values)[:, None, None]
         for values in (trained.normalization.mean, trained.normalization.std)
     )
-    return trained.network(((rgb - mean) / std)[None])[0]
+    return ((rgb - mean) / std)[None]
+
+
+@torch.no_grad()
+def imported_scores(trained: LoadedNetwork) -> Tensor:
+    """Return scores ``(K, h, w)`` of the imported network for the photo."""
+    scores: Tensor = trained.network(normalized(trained))[0]
+    return scores
 
 
 def assert_same(scores: Tensor, expected: Tensor) -> None:

@@ -61,6 +61,45 @@ def test_scores_are_those_of_the_library(
     networks.assert_same(scores.exp() if shares else scores, expected)
 
 
+@pytest.mark.parametrize(
+    ("made", "noise", "count"), [(networks.mask2former, 1.2, 2), (networks.eomt, 0.3, 1)]
+)
+@torch.no_grad()
+def test_objects_are_those_of_the_library(
+    made: Callable[[], Any], noise: float, count: int, tmp_path: Path
+) -> None:
+    network, processor = networks.saved(made, tmp_path, noise=noise)
+    trained = networks.imported(tmp_path, things=networks.NAMES[2:])
+    assert trained.things == networks.NAMES[2:]
+    images = networks.normalized(trained)
+    (found,) = trained.network(images)["segments"]
+    returned = network(pixel_values=images)
+    settings: dict[str, Any] = {"label_ids_to_fuse": {0, 1}}
+    if made is networks.eomt:
+        returned["patch_offsets"], settings = None, {"stuff_classes": [0, 1]}
+    (expected,) = processor.post_process_panoptic_segmentation(
+        returned, target_sizes=[(64, 64)], **settings
+    )
+    assert len(expected["segments_info"]) == len(found.classes) == count
+    assert 0 < float((found.numbers > 0).float().mean()) < 1
+    for number, info in enumerate(expected["segments_info"], 1):
+        mask = expected["segmentation"] == info["id"]
+        assert torch.equal(found.numbers == number, mask)
+        assert (int(found.classes[number - 1]), round(float(found.scores[number - 1]), 6)) == (
+            info["label_id"],
+            info["score"],
+        )
+
+
+def test_objects_of_wrong_classes_are_refused(tmp_path: Path) -> None:
+    networks.saved(networks.mask2former, tmp_path / "masks")
+    with pytest.raises(SettingError, match=r"things: found chair; expected among wall, floor"):
+        networks.imported(tmp_path / "masks", things=["chair"])
+    networks.saved(networks.segformer, tmp_path / "scores")
+    with pytest.raises(SettingError, match=r"things: found car; expected null, for segformer"):
+        networks.imported(tmp_path / "scores", things=["car"])
+
+
 def test_oneformer_gets_the_semantic_task(tmp_path: Path) -> None:
     (tmp_path / "classes.json").write_text(
         json.dumps({k: {"name": name, "isthing": 0} for k, name in enumerate(networks.NAMES)})
