@@ -81,14 +81,13 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 def _unlabeled(settings: EvaluateSettings, loaded: LoadedNetwork) -> Any:
     """Return what takes the place of a data set for panoramas without labels."""
-    representation = build_from_config(settings.representation or {}, "representation")
     inputs = Inputs.find(str(settings.input))
     jobs = list(inputs.jobs(inputs.names))
     return SimpleNamespace(
         noun="panoramas" + " without depth" * ("depth" in loaded.inputs),
         splits=lambda: {"test": jobs}, groups=lambda _: (), folds=(),
         facts={"data": str(settings.input)}, class_names=loaded.class_names,
-        representation=representation,
+        representation=build_from_config(settings.representation or {}, "representation"),
     )  # fmt: skip
 
 
@@ -125,7 +124,7 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
         section = {**loaded.representation, **stored, **section}
     if section.get("level", 0) is None:
         section = {**section, "level": level}
-    data = settings.data
+    data = settings.data if settings.input is None else {"_target_": "panoramas"}
     if loaded.inputs:
         mean, std = list(loaded.normalization.mean), list(loaded.normalization.std)
         normalization = {"mean": mean, "std": std}

@@ -279,9 +279,7 @@ class _Prediction:
         """Return a finished image at its scale, as `predict` does; the unscaled depth is kept."""
         scale, facts = self._scales.get(job.name, 1.0), self._finished[job.name][self._head.summary]
         pixels = torch.from_numpy(np.load(self._unscaled(job.name)) * np.float32(scale))
-        changed = ("known", "too_far", "colors")
-        kept = {name: value for name, value in facts.items() if name not in changed}
-        return job.value, (pixels, {**kept, "scale": scale})
+        return job.value, (pixels, {**facts, "scale": scale})
 
     def pictures(self, inputs: Inputs, entries: Mapping[str, Any]) -> Iterator[Any]:
         """Yield compressed images for the report, if the predicted pixels were written.

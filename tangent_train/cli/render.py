@@ -76,7 +76,6 @@ def render(settings: RenderSettings) -> None:
         remedy = "Example: tangent-render input=panoramas output=tangent"
         raise SettingError("input, back and poses", found=found, expected=expected, remedy=remedy)
     run, read = _MODES[modes[0]]
-    read = read | (_OF_NERFSTUDIO if settings.nerfstudio else set())
     check_read(settings, {*read, *modes, "output", "overwrite"})
     run(settings, settings.model_dump(mode="json", exclude={*settings.not_content}))
 
@@ -317,14 +316,13 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
         _render_views,
         {"every", "area", "eye", "views", "base_level", "level", "dim", "faces", "rotation"}
         | {*_DIRECTIONS, "format"}
-        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"},
+        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"}
+        | {"nerfstudio", "poses", "cameras", "depth", "depth_scale"},
     ),
     "back": (_render_back, {"cameras", "blend", "height", "kind", "depth_channel", "z_depth"}),
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
-
-_OF_NERFSTUDIO = {"nerfstudio", "poses", "cameras", "depth", "depth_scale"}
 
 _SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
 

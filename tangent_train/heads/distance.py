@@ -344,16 +344,17 @@ class DistanceHead(Head):
         known, too_far = (
             np.sum(angles, where=mask) / total for mask in (np.isfinite(depth), depth > self._most)
         )
-        facts = {"known": known, "too_far": too_far, **predicted.facts}
+        facts = {**predicted.facts, "known": known, "too_far": too_far}
         summary: dict[str, Any] = {"unit": "m" if self.is_metric else "relative"}
         if known:
             median = np.median(depth[tuple(spread_pixels(predicted, _SAMPLES))])
             facts |= {"nearest": np.nanmin(depth), "median": median, "farthest": np.nanmax(depth)}
             summary["colors"] = [float(f"{limit:.4g}") for limit in pictures.distance_limits(depth)]
-        return summary | {
+        rounded = {
             name: float(f"{value:.4g}") if isinstance(value, float | np.floating) else value
             for name, value in facts.items()
         }
+        return rounded | summary
 
     def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], list[list[str]]]:
         """Return the means of the summaries over the images."""

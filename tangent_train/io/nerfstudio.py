@@ -56,12 +56,9 @@ def write_transforms(
     if missing := [name for name, pose in poses.items() if pose is None]:
         print_text(f"Without a pose, and left out: {listed(missing)}.")
     frames = {p + n: (rig[p], pose) for n, pose in poses.items() if pose is not None for p in rig}
-    entries = [_frame(name, *of_frame) for name, of_frame in frames.items()]
-    if entries and (folder / "depths").is_dir():
-        entries = [
-            {**entry, "depth_file_path": f"depths/{name}.png"}
-            for name, entry in zip(frames, entries, strict=True)
-        ]
+    has_depth = bool(frames) and (folder / "depths").is_dir()
+    entries = [_frame(name, *of_frame, has_depth=has_depth) for name, of_frame in frames.items()]
+    if has_depth:
         share = _MOST_POINTS / sum(entry["w"] * entry["h"] for entry in entries)
         parts = [_points(folder, name, share, *of_frame) for name, of_frame in frames.items()]
         points = map(np.concatenate, zip(*parts, strict=True))
@@ -75,13 +72,14 @@ def write_transforms(
     write_text(folder / TRANSFORMS_FILE, json.dumps(content, indent=1) + "\n")
 
 
-def _frame(name: str, view: View, pose: PanoramaPose) -> dict[str, Any]:
+def _frame(name: str, view: View, pose: PanoramaPose, *, has_depth: bool) -> dict[str, Any]:
     (grid, face), matrix = view, np.eye(4)
     matrix[:3, :3] = pose.world_from_panorama @ grid.world_from_camera[face] * _TO_OPENGL
     matrix[:3, 3] = pose.location_m
     (fx, _, cx), (_, fy, cy), _ = grid.camera_matrix.tolist()
     camera = {"w": grid.size[1], "h": grid.size[0], "fl_x": fx, "fl_y": fy}
     files = {"file_path": f"images/{name}", "mask_path": f"masks/{name}.png"}
+    files |= {"depth_file_path": f"depths/{name}.png"} if has_depth else {}
     center = {"cx": cx + 0.5, "cy": cy + 0.5}
     return {**files, **camera, **center, "transform_matrix": matrix.tolist()}
 

@@ -26,8 +26,6 @@ Sums = Mapping[str, NDArray[np.float64]]
 ``solid_angle``, ``regions`` and ``seam``, see `SegmentationCounts`. Each other score has two
 numbers: its value and 1, or 0 and 0 if it is undefined."""
 
-_OF_CLASSES = ("pixels", "solid_angle", "regions", "seam")
-
 
 def as_sums(scores: Mapping[str, Float[np.ndarray, " images"]]) -> Sums:
     """Return numbers of images whose sums give the means of scores; NaN is left out."""
@@ -47,7 +45,8 @@ def scores_of_sums(sums: Sums, absent_class: str = "skip") -> dict[str, NDArray[
     Returns:
         Scores by name; NaN where they are undefined.
     """
-    pairs = {name: of for name, of in sums.items() if name not in _OF_CLASSES}
+    of_classes = "pixels", "solid_angle", "regions", "seam"
+    pairs = {name: of for name, of in sums.items() if name not in of_classes}
     numbers = {name: np.where(of[..., 1] > 0, of[..., 1], np.nan) for name, of in pairs.items()}
     scores = {name: sums[name][..., 0] / number for name, number in numbers.items()}
     if "pixels" not in sums:
