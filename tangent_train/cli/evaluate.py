@@ -12,6 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
 from lightning.pytorch.utilities import rank_zero_only
 
+from datamodules.core.label_map import PANOPTIC
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
@@ -64,6 +65,9 @@ def evaluate(settings: EvaluateSettings) -> None:
             expected=f"{listed(loaded.class_names)}, which the network was trained with",
             remedy="Map classes with label_map=.",
         )
+    if head.labels == PANOPTIC and not {*loaded.things} & {*data.things}:
+        found, expected = "a network without objects", "objects of " + " or ".join(data.things)
+        raise SettingError("checkpoint", found=found, expected=expected)
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)
     head = build_head(settings, data, loaded.depth_kind)
@@ -81,14 +85,13 @@ def evaluate(settings: EvaluateSettings) -> None:
 
 def _unlabeled(settings: EvaluateSettings, loaded: LoadedNetwork) -> Any:
     """Return what takes the place of a data set for panoramas without labels."""
-    representation = build_from_config(settings.representation or {}, "representation")
     inputs = Inputs.find(str(settings.input))
     jobs = list(inputs.jobs(inputs.names))
     return SimpleNamespace(
         noun="panoramas" + " without depth" * ("depth" in loaded.inputs),
         splits=lambda: {"test": jobs}, groups=lambda _: (), folds=(),
         facts={"data": str(settings.input)}, class_names=loaded.class_names,
-        representation=representation,
+        representation=build_from_config(settings.representation or {}, "representation"),
     )  # fmt: skip
 
 
@@ -125,7 +128,7 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
         section = {**loaded.representation, **stored, **section}
     if section.get("level", 0) is None:
         section = {**section, "level": level}
-    data = settings.data
+    data = settings.data if settings.input is None else {"_target_": "panoramas"}
     if loaded.inputs:
         mean, std = list(loaded.normalization.mean), list(loaded.normalization.std)
         normalization = {"mean": mean, "std": std}

@@ -495,14 +495,6 @@ class TrainSettings(RunSettings):
 class FilesSettings(RunSettings):
     """Settings of commands that read predictions of any program."""
 
-    # --- consistency ---
-    consistency: NonNegativeInt = 0
-    """panoramas: compare predictions for this number of turns about the vertical, and for as many
-    random rotations, with the first prediction; 0 = none (8 with input=)"""
-    input: str | Path | None = None
-    """only consistency, of panoramas without labels, instead of data=: panorama or video, folder of
-    them, or pattern, e.g. 'holiday/*.jpg'"""
-
     # --- predictions of any program ---
     predictions: ExistingPath | None = None
     """folder of predictions of any program, which are scored instead of a network: label maps,
@@ -539,6 +531,14 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
     checkpoint: ExistingPath | None = None  # type: ignore[assignment]
     """network file, written by tangent-train, tangent-import or tangent-export; required without
     predictions="""
+
+    # --- consistency ---
+    consistency: NonNegativeInt = 0
+    """panoramas: compare predictions for this number of turns about the vertical, and for as many
+    random rotations, with the first prediction; 0 = none (8 with input=)"""
+    input: str | Path | None = None
+    """only consistency, of panoramas without labels, instead of data=: panorama or video, folder of
+    them, or pattern, e.g. 'holiday/*.jpg'"""
 
     # --- views ---
     representation: Section | None = None  # type: ignore[assignment]
