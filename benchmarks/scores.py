@@ -108,7 +108,7 @@ def _bare_seconds(folder: Path) -> float:
     start = time.process_time()
     for k in range(2 * _DISTINCT):
         truth, prediction = (
-            cv2.imread(str(folder / kind / f"{k % 2}.png"), cv2.IMREAD_UNCHANGED)
+            np.asarray(cv2.imread(str(folder / kind / f"{k % 2}.png"), cv2.IMREAD_UNCHANGED))
             for kind in ("labels", "maps")
         )
         pairs = truth.astype(np.int64) * (NUM_CLASSES + 1) + prediction
