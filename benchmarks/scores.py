@@ -107,10 +107,8 @@ def _bare_seconds(folder: Path) -> float:
     """Return the seconds of a panorama in a loop that computes mIoU only."""
     start = time.process_time()
     for k in range(2 * _DISTINCT):
-        truth, prediction = (
-            cv2.imread(str(folder / kind / f"{k % 2}.png"), cv2.IMREAD_UNCHANGED)
-            for kind in ("labels", "maps")
-        )
+        names = [str(folder / kind / f"{k % 2}.png") for kind in ("labels", "maps")]
+        truth, prediction = (np.asarray(cv2.imread(n, cv2.IMREAD_UNCHANGED)) for n in names)
         pairs = truth.astype(np.int64) * (NUM_CLASSES + 1) + prediction
         np.bincount(pairs.ravel(), minlength=(NUM_CLASSES + 1) ** 2)
     return (time.process_time() - start) / (2 * _DISTINCT)

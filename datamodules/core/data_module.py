@@ -26,7 +26,13 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 from datamodules.core.cache import Cache
 from datamodules.core.dataset import SplitDataset
 from datamodules.core.files import SPLITS, Problems, Split, draw_groups
-from datamodules.core.label_map import PIXEL_CLASSES, ClassWeights, class_weights, label_doubts
+from datamodules.core.label_map import (
+    PANOPTIC,
+    PIXEL_CLASSES,
+    ClassWeights,
+    class_weights,
+    label_doubts,
+)
 from datamodules.core.loading import EpochSampler, share_of_process, this_process
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, wrong_setting
@@ -427,7 +433,7 @@ class DataModule(LightningDataModule, ABC):
     @property
     def num_classes(self) -> int:
         """Number of classes K, which is the number of scores of a network."""
-        return len(self.class_names) - (self.labels == PIXEL_CLASSES)
+        return len(self.class_names) - (self.labels in (PIXEL_CLASSES, PANOPTIC))
 
     def class_weights(self, kind: ClassWeights) -> Tensor:
         """Return weights of the classes in the loss, from the labels of the training split.

@@ -25,8 +25,9 @@ from tangent_train.threads import in_threads
 if TYPE_CHECKING:
     from tangent_train.rendering.representations.views import Sampler
 
-Labels = NDArray[np.unsignedinteger[Any]]
-"""Labels ``(H, W)``, 0 where unknown: uint8 classes, or uint16 distances in steps of 1/512 m."""
+Labels = NDArray[np.integer[Any]]
+"""Labels ``(H, W)``, 0 where unknown: uint8 classes, uint16 distances in steps of 1/512 m, or an
+int32 panoptic map."""
 
 _Images = TypeVar("_Images", Sequence[Tensor], Tensor)
 
@@ -40,8 +41,7 @@ class Image(NamedTuple):
         rgb: ``(H, W, 3)`` uint8.
         depth: ``(H, W)`` uint16 distance from the center in steps of 1/512 m, 0 where missing; None
             if not read. Before `ImageDataModule.read`, z-depth of photos.
-        labels: ``(H, W)`` uint8 classes, 0 where unknown; or uint16 distances like `depth`, which
-            is then None.
+        labels: `Labels`; with distances, `depth` is None.
         up: ``(3,)`` direction of the zenith in a panorama, a unit vector; None if it is z.
         valid: ``(H, W)`` bool, the recorded pixels of a panorama; None if all are. Elsewhere,
             labels and depth are 0, and colors are filled.
@@ -78,7 +78,7 @@ class Sample(NamedTuple, Generic[_Images]):
         images: As rendered, to save bytes: RGB ``(P, h, w, 3)`` uint8, optionally depth
             ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32. `normalize` converts them to
             ``(P, C, h, w)`` float32 on the device.
-        labels: ``(P, h, w)`` uint8, or int32 for distances, 0 where unknown; in evaluation of a
+        labels: ``(P, h, w)`` uint8, or int32 for distances and panoptic maps; in evaluation of a
             panorama ``(H, W)``.
         ray_lengths: ``(1 or P, h, w)`` float32, see `Views.ray_lengths`, for distances as labels;
             else a 1, ``(1, 1, 1)``.

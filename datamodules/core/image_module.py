@@ -32,7 +32,7 @@ from datamodules.core.inputs import (
     channel_names,
     normalize,
 )
-from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES, UNKNOWN_NAME, LabelMap
+from datamodules.core.label_map import DISTANCE, PANOPTIC, PIXEL_CLASSES, UNKNOWN_NAME, LabelMap
 from tangent_train.errors import DataError, width_height
 from tangent_train.geometry import PanoramaPose, shift_range
 from tangent_train.geometry.sphere import check_area
@@ -47,6 +47,7 @@ from tangent_train.io.gpano import (
 from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import read_depth_m, read_image_size, read_rgb
 from tangent_train.kinds import Upright
+from tangent_train.metrics.panoptic import LABEL
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.orientation.manhattan import MOST_ROWS
 from tangent_train.progress import show_progress
@@ -78,7 +79,7 @@ class ImageDataModule(DataModule):
 
     Args:
         labels: `pixel_classes`, or `distance`: depth files give the labels, and there are no
-            classes, see `DISTANCE`.
+            classes, see `DISTANCE`. `panoptic`: classes and objects, see `PANOPTIC`.
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
         classes: Name of one of the `label_maps`; None for the first.
@@ -87,6 +88,7 @@ class ImageDataModule(DataModule):
     Attributes:
         normalizations: Default normalizations, without and with depth.
         label_maps: Label map of each set of classes, by its name.
+        things: Names of the classes whose objects are numbered in the label files.
         units_per_m: Units of 16-bit depth files in a meter.
         no_depth: Reason why depth cannot be an input; empty if it can.
         no_distances: Reason why distances cannot be the labels, besides `no_depth`.
@@ -100,13 +102,14 @@ class ImageDataModule(DataModule):
         RGBD_NORMALIZATION,
     )
     label_maps: ClassVar[Mapping[str, LabelMap]] = {}
+    things: ClassVar[Sequence[str]] = ()
     units_per_m: ClassVar[int] = STEPS_PER_M
     no_depth: ClassVar[str] = ""
     no_distances: ClassVar[str] = ""
     fact_settings: ClassVar[tuple[str, ...]] = ("unknown",)
     cache_settings: ClassVar[tuple[str, ...]] = ("read_shape", "unknown", "labels", "label_map")
 
-    labels: Literal["pixel_classes", "distance"] = "pixel_classes"  # type: ignore[misc]
+    labels: Literal["pixel_classes", "distance", "panoptic"] = "pixel_classes"  # type: ignore[misc]
     inputs: Sequence[Input] = ("rgb",)
     color_jitter: Annotated[float, Field(ge=0, le=1)] = 0.0
     classes: str | int | None = None
@@ -118,6 +121,8 @@ class ImageDataModule(DataModule):
         with_depth, distances = "depth" in self.inputs, self.has_distances
         no_labels, no_depth = self.no_depth or self.no_distances, self.no_depth
         self.refuse("labels", distances and no_labels, f"{PIXEL_CLASSES}: {no_labels}")
+        expected = f"{PIXEL_CLASSES}: the label files do not number objects"
+        self.refuse("labels", self.labels == PANOPTIC and not self.things, expected)
         self.refuse("classes", distances and self.classes is not None, "null, with distances")
         no_depth = "it is the target" if distances else no_depth
         self.refuse("inputs", with_depth and no_depth, f"no depth: {no_depth}")
@@ -165,7 +170,7 @@ class ImageDataModule(DataModule):
         depth = None if files.depth is None else self.decode_depth(files)
         return Image(read_rgb(files.rgb), depth, labels, camera_matrix=self.decode_camera(files))
 
-    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+    def decode_labels(self, files: ImageFiles) -> Labels:
         """Return the labels of an image."""
         label_map: Any = self.label_map
         labels: NDArray[np.uint8] = label_map.read_labels(files.labels)
@@ -244,8 +249,14 @@ class ImageDataModule(DataModule):
                     f"median distance {median_m:.3g} m" if known.size else "no distance below 128 m"
                 )
                 warning = f"{files.depth}: {found}; check the units and the missing value."
-            labels = labels > 0
-        return np.bincount(labels.ravel(), minlength=len(self.label_names)), warning
+        labels = self.counted_labels(labels).ravel()
+        return np.bincount(labels, minlength=len(self.label_names)), warning
+
+    def counted_labels(self, labels: Any) -> Any:
+        """Return the index in `label_names` of each pixel of labels, an array or a tensor."""
+        if self.has_distances:
+            return labels > 0
+        return labels // LABEL if self.labels == PANOPTIC else labels
 
     # --- samples -------------------------------------------------------------------------------
 

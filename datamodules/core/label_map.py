@@ -32,6 +32,9 @@ DISTANCE = "distance"
 """Kind of labels: a distance from the center for every pixel, in steps of 1/512 m, 0 where
 unknown."""
 
+PANOPTIC = "panoptic"
+"""Kind of labels: the class and the object of every pixel, see `metrics.panoptic`."""
+
 ClassWeights = Literal["log", "sqrt", "none"]
 """Class weighting of the loss; see `class_weights`."""
 

@@ -33,6 +33,9 @@ CLASSES: tuple[str, ...] = (
 EIGHT = ("ceiling", "chair", "door", "floor", "sofa", "table", "wall", "window")
 """The classes of the adaptation benchmarks SPin8, SPan8 and S3D8."""
 
+THINGS = tuple(name for name in CLASSES if name not in ("ceiling", "clutter", "floor", "wall"))
+"""Classes that have objects in a panoptic map."""
+
 UNKNOWN_CLASS = "<UNK>"
 """Class of unlabeled instances."""
 

@@ -32,7 +32,7 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,15 +40,18 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from datamodules.core.data_module import data_set
+from datamodules.core.dataset import Labels
 from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
-from datamodules.core.label_map import LabelMap
+from datamodules.core.label_map import PANOPTIC, LabelMap
 from datamodules.stanford2d3ds import files as stanford
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.image_files import glob_files
+from tangent_train.io.pixel_files import read_rgb
+from tangent_train.metrics.panoptic import LABEL
 
 GET_IT = "Get Stanford2D3DS from http://buildingparser.stanford.edu, or choose data=synthrooms."
 """Remedy if the data set is missing."""
@@ -57,6 +60,7 @@ _NAME = re.compile(
     r"camera_([0-9a-f]{32})_([A-Za-z]+_\d+)_frame_(equirectangular|\d+)_domain_rgb\.png"
 )
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+_BYTE = 256
 _THIRTEEN = LabelMap.of(stanford.CLASSES)
 
 
@@ -193,11 +197,19 @@ class StanfordImages(ImageDataModule):
         path = self.label_table or next(filter(Path.is_file, places), places[0])
         return read_label_table(path).regrouped(self.label_map.names)
 
-    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """See `ImageDataModule`: by the class table."""
-        table: Any = self._label_table
-        labels: NDArray[np.uint8] = table.read_labels(files.labels)
-        return labels
+    def decode_labels(self, files: ImageFiles) -> Labels:
+        """See `ImageDataModule`: by the class table.
+
+        The number of an object is its index in the table, without the upper byte.
+        """
+        table, path = cast("LabelMap", self._label_table), cast("Path", files.labels)
+        colors = read_rgb(path, as_stored=True)
+        labels = table.decode(colors, path)
+        if self.labels != PANOPTIC:
+            return labels
+        numbers = colors[..., 1:] @ np.array([_BYTE, 1], np.int32)
+        is_thing = np.isin(self.class_names, self.things)[labels]
+        return labels * np.int32(LABEL) + numbers * is_thing
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
         """See `ImageDataModule`: by the pose file, if there is one."""
@@ -211,6 +223,7 @@ class StanfordImages(ImageDataModule):
 class Stanford2D3DS(StanfordImages, PanoramaDataModule):
     """Stanford2D3DS, 13 or 8 classes, in the three folds of its authors."""
 
+    things = stanford.THINGS
     group = "pano"
 
 

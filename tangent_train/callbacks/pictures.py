@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tangent_train.console import print_text
 from tangent_train.errors import first_line
-from tangent_train.heads.base import RGB
+from tangent_train.heads.base import RGB, PredictedImage
 from tangent_train.heads.pictures import evenly_spread, shown_arrays
 from tangent_train.io.pixel_files import write_pixels
 from tangent_train.results.page import EncodedImage, encode_image
@@ -139,9 +139,11 @@ def _encoded(
     truth, count = task.head.truth(target), len(task.head.class_names)
     given = image, truth, prediction, task.representation
     rgb, true, shown = shown_arrays(*given, cut=False, unknown=task.head.unknown)
+    maps = task.head.report_maps(PredictedImage(image, shown))
+    maps["truth"] = task.head.report_maps(PredictedImage(image, true))["prediction"]
     error, note = task.head.error(prediction, truth)
     how: dict[str, Any] = {"sphere": target.ndim == 2, "note": note, "confidence": confidence}
-    return -error, encode_image(name, rgb, count, prediction=shown, truth=true, **how)
+    return -error, encode_image(name, rgb, count, **maps, **how)
 
 
 def _dataset(trainer: Trainer, split: str) -> Any:

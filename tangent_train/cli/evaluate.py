@@ -12,6 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
 from lightning.pytorch.utilities import rank_zero_only
 
+from datamodules.core.label_map import PANOPTIC
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
@@ -64,6 +65,9 @@ def evaluate(settings: EvaluateSettings) -> None:
             expected=f"{listed(loaded.class_names)}, which the network was trained with",
             remedy="Map classes with label_map=.",
         )
+    if head.labels == PANOPTIC and not {*loaded.things} & {*data.things}:
+        found, expected = "a network without objects", "objects of " + " or ".join(data.things)
+        raise SettingError("checkpoint", found=found, expected=expected)
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)
     head = build_head(settings, data, loaded.depth_kind)

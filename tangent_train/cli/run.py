@@ -25,7 +25,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
 from datamodules.core.image_module import ImageDataModule
-from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
+from datamodules.core.label_map import DISTANCE, PANOPTIC, PIXEL_CLASSES
 from datamodules.core.loading import gathered_order
 from models.unet import check_size
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
@@ -237,6 +237,9 @@ def build(settings: RunSettings, file: Path | None = None, trust: Sequence[str] 
     Raises:
         SettingError: A setting, or a combination of settings, is invalid.
     """
+    if _needed_labels(settings) == PANOPTIC:
+        expected = "task=segmentation: objects are evaluated, not trained"
+        raise SettingError("task", found=PANOPTIC, expected=expected)
     data = build_data(settings)
     head = build_head(settings, data)
     # Pretrained weights are not fetched if a checkpoint replaces them.
@@ -251,19 +254,24 @@ def build(settings: RunSettings, file: Path | None = None, trust: Sequence[str] 
     return data, build_task(settings, data, network, head)
 
 
+def _needed_labels(settings: RunSettings) -> Any:
+    """Return the kind of labels of the task."""
+    return get_class(settings.task["head"]["_target_"]).labels  # type: ignore[attr-defined]
+
+
 def open_data(settings: RunSettings) -> Any:
-    """Build the data module of a run; images have distances as labels if the task needs them."""
+    """Build the data module of a run; images have the kind of labels that the task needs."""
     representation = build_from_config(settings.representation, "representation")
     is_images = issubclass(get_class(settings.data["_target_"]), ImageDataModule)
-    needed = get_class(settings.task["head"]["_target_"]).labels  # type: ignore[attr-defined]
-    given = {"labels": DISTANCE} if is_images and needed == DISTANCE else {}
+    needed = _needed_labels(settings)
+    given = {"labels": needed} if is_images and needed in (DISTANCE, PANOPTIC) else {}
     return build_from_config(settings.data, "data", representation=representation, **given)
 
 
 def build_data(settings: RunSettings) -> Any:
     """Build the data module of a run, and check that it has the labels of the task."""
     data: Any = open_data(settings)
-    needed = get_class(settings.task["head"]["_target_"]).labels  # type: ignore[attr-defined]
+    needed = _needed_labels(settings)
     labels = getattr(data, "labels", "pairs, which is tangent-keypoints")
     if needed != labels:
         expected = f"a task for {labels}, the labels of {type(data).__name__}"
@@ -274,6 +282,7 @@ def build_data(settings: RunSettings) -> Any:
 def build_head(settings: RunSettings, data: Any, depth_kind: str | None = None) -> Any:
     """Build the head of a run; `depth_kind` is that of a network from a file."""
     given = {} if depth_kind is None else {"depth_kind": depth_kind}
+    given |= {"things": data.things} if data.labels == PANOPTIC else {}
     section = settings.task["head"]
     return build_from_config(section, "task.head", class_names=data.class_names, **given)
 

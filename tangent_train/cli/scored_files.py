@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.label_map import LabelMap, read_label_map
+from datamodules.core.label_map import PANOPTIC, PIXEL_CLASSES, LabelMap, read_label_map
 from tangent_train.callbacks.pictures import Pictures
 from tangent_train.cli.run import Run, build_data, build_head
 from tangent_train.config.settings import EvaluateSettings, FilesSettings, refuse_typed
@@ -27,6 +27,7 @@ from tangent_train.heads.pictures import evenly_spread
 from tangent_train.io.gpano import read_area
 from tangent_train.io.image_files import composed, walk_files
 from tangent_train.io.pixel_files import read_depth_m, read_image_size
+from tangent_train.metrics.panoptic import LABEL
 from tangent_train.progress import show_progress
 from tangent_train.rendering.resampling import resize
 from tangent_train.results.tables import Table, percent, score_text
@@ -108,8 +109,8 @@ def check_files(settings: FilesSettings) -> bool:
     def count(place: int, labels: Tensor, prediction: Tensor) -> None:
         variants.update(place, prediction, scored.head.truth(labels))
         for row, pixels in enumerate((prediction, labels)):
-            shown = pixels > 0 if data.has_distances else pixels
-            counts[row] += np.bincount(shown.flatten().numpy(), minlength=counts.shape[1])
+            shown = data.counted_labels(pixels).flatten()
+            counts[row] += np.bincount(shown.numpy(), minlength=counts.shape[1])
 
     scored.for_each(count, "Checking")
     missing, unusable, _ = problems = scored.problems
@@ -134,7 +135,7 @@ class Variants:
 
     def __init__(self, scored: ScoredFiles) -> None:
         head, data = scored.head, scored.data
-        numberings = {} if data.has_distances else _numberings(data.num_classes)
+        numberings = {} if data.labels != PIXEL_CLASSES else _numberings(data.num_classes)
         self._head, self._changes = head, {_AS_THEY_ARE: torch.clone} | _MISTAKES | numberings
         self._metrics = {name: head.build_metric() for name in self._changes}
         self._compared = set(evenly_spread(_COMPARED, len(scored.indices)))
@@ -274,7 +275,7 @@ class ScoredFiles:
     def _folder(self) -> Path:
         """Return the folder of the files: of an output folder of this project, a part of it."""
         given: Any = self._settings.predictions
-        kind = given / ("depth" if self.data.has_distances else "labels")
+        kind = given / self.head.source
         return kind if kind.is_dir() else given
 
     def _matched(self) -> tuple[dict[str, Path], list[Path]]:
@@ -363,6 +364,9 @@ class ScoredFiles:
                 raise DataError(path, found="an archive", expected="distances: .npy, EXR or PNG")
             depth = read_depth_m(path, settings.depth_scale, settings.depth_channel)
             return np.where(depth > 0, depth, np.float32(np.nan))
+        if self.data.labels == PANOPTIC:
+            labels, numbers = np.divmod(self.head.read(path), LABEL)
+            return label_map.decode(labels, path) * np.int32(LABEL) + numbers
         if path.suffix.lower() not in _ARRAYS:
             return label_map.read_labels(path)
         array = _array(path)

@@ -14,14 +14,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 from torch import Tensor
 
+from datamodules.core.label_map import PANOPTIC
 from models.segments import Segments
 from tangent_train.files import csv_text, write_text
 from tangent_train.heads import pictures
-from tangent_train.heads.base import PICTURES, RGB, PredictedImage
+from tangent_train.heads.base import PICTURES, RGB, PredictedImage, Scores
 from tangent_train.heads.classes import ClassesHead, LabelMosaic
 from tangent_train.heads.objects import OBJECT_COLUMNS, described, join_objects
-from tangent_train.io.pixel_files import read_pixels, write_pixels
-from tangent_train.metrics.panoptic import LABEL
+from tangent_train.io.pixel_files import read_rgb, write_pixels
+from tangent_train.metrics.image_sums import Sums, means_of_sums
+from tangent_train.metrics.panoptic import LABEL, quality
+from tangent_train.metrics.scores import ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.rendering.representations.views import Views
 
 _BYTE = 256
@@ -39,6 +42,20 @@ class PanopticHead(ClassesHead):
         **settings: See `ClassesHead`.
     """
 
+    labels: ClassVar[str] = PANOPTIC
+    columns: ClassVar[Mapping[str, ScoreColumn]] = with_solid_angle(
+        {
+            "pq": ScoreColumn("PQ", "%", "pq", "PQ"),
+            "sq": ScoreColumn("SQ", "%", "sq", "SQ", is_main=False),
+            "rq": ScoreColumn("RQ", "%", "rq", "RQ", is_main=False),
+        }
+    ) | {
+        "pq_things": ScoreColumn("PQ of things"),
+        "pq_stuff": ScoreColumn("PQ of stuff"),
+        "pq_seam": ScoreColumn("PQ of objects across ±180°", is_main=False, of_sphere=True),
+        "pq_poles": ScoreColumn("PQ of objects near the poles", is_main=False, of_sphere=True),
+    }
+    main_score: ClassVar[str] = "pq"
     waits: ClassVar[bool] = True  # objects are joined while the next image is predicted
     usual_kinds: ClassVar[Sequence[str]] = ("labels", *PICTURES)
     suffixes = MappingProxyType(
@@ -50,6 +67,59 @@ class PanopticHead(ClassesHead):
     ) -> None:
         super().__init__(class_names, **settings)
         self.is_thing = np.isin(self.class_names, list(things))
+
+    # Scores
+
+    def build_metric(self) -> Any:
+        """Build the metric, which keeps the sums of the segments of each panorama."""
+        from tangent_train.metrics.collected import PanopticMetric  # seconds to import
+
+        return PanopticMetric(len(self.class_names))
+
+    def scores(self, result: Any) -> Scores:
+        """Return PQ, SQ and RQ by pixels and by solid angle.
+
+        Args:
+            result: Sums ``(panoramas, 2, 3, K, 4)``, see `panoptic_sums`.
+        """
+        pixels, angles = map(quality, result[:, :, 0].sum(axis=0))
+        return Scores(means_of_sums(self.image_sums(result)), pixels | by_solid_angle(angles))
+
+    def image_sums(self, result: Any) -> Sums:
+        """Return the sums of each panorama for classes with and without objects."""
+        is_thing = self.is_thing[1:]
+        return {"things": result[..., is_thing, :], "stuff": result[..., ~is_thing, :]}
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """The classes that have objects."""
+        return {"things": ", ".join(np.array(self.class_names)[self.is_thing])}
+
+    def comparable(self, prediction: Tensor, truth: Tensor, ray_lengths: Any = None) -> Tensor:
+        """Return a panoptic map as it is written."""
+        codes = self._known(prediction.cpu().numpy())
+        return torch.from_numpy(codes).to(prediction.device)
+
+    def _known(self, codes: NDArray[Any]) -> NDArray[Any]:
+        """Return a panoptic map that is 0 where a thing has no object."""
+        is_none = self.is_thing[codes // LABEL] & (codes % LABEL == 0)
+        return np.where(is_none, 0, codes)
+
+    def panel(self, rgb: RGB, truth: NDArray[Any], prediction: NDArray[Any]) -> RGB:
+        """Draw classes in a grid, see `ClassesHead.panel`, with the borders of objects."""
+        maps, names = (truth, prediction), self.class_names
+        return pictures.prediction_panel(rgb, truth // LABEL, prediction // LABEL, names, maps)
+
+    def error(self, prediction: Tensor, truth: Tensor) -> tuple[float, str]:
+        """Return 1 − PQ of one panorama, and the PQ; 0 and "" without known pixels."""
+        if not truth.any():
+            return 0.0, ""
+        metric = self.build_metric()
+        metric.update(prediction.cpu(), truth.cpu())
+        pq = self.scores(metric.compute()).means["pq"]
+        return 1 - pq, f"PQ {100 * pq:.1f}\u00a0%"
+
+    # Pictures and files
 
     def _new_mosaic(self, *given: Any, **settings: Any) -> PanopticMosaic:
         return PanopticMosaic(self, *given, **settings)
@@ -66,15 +136,14 @@ class PanopticHead(ClassesHead):
 
     def write_source(self, file: Path, pixels: NDArray[Any]) -> None:
         """Write a panoptic map as RGB: ``R + 256 G + 65536 B``; 0 where a thing has no object."""
-        is_none = self.is_thing[pixels // LABEL] & (pixels % LABEL == 0)
-        codes = np.where(is_none, 0, pixels).astype(np.uint32)
+        codes = self._known(pixels).astype(np.uint32)
         write_pixels(
             file, np.stack([codes >> shift & 255 for shift in (0, 8, 16)], -1).astype("u1")
         )
 
     def read(self, file: Path) -> NDArray[np.int32]:
         """Read a panoptic map."""
-        return read_pixels(file, indices=False) @ np.array([1, _BYTE, LABEL], np.int32)
+        return read_rgb(file, as_stored=True) @ np.array([1, _BYTE, LABEL], np.int32)
 
     def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> RGB:
         """Color the labels, or overlay the image with them and the borders of objects."""
@@ -91,12 +160,13 @@ class PanopticHead(ClassesHead):
         return pictures.with_class_legend(painted, labels[labels > 0], self.class_names)
 
     def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
-        """Return labels, numbers of objects, and their descriptions."""
+        """Return labels, numbers of objects, and their descriptions, which evaluations lack."""
         labels, numbers = np.divmod(predicted.pixels, LABEL)
         text = (
             "{class} {number}, score {score:.2f}, {width_deg:.1f}° × {height_deg:.1f}°".format_map
         )
-        objects = [segment for segment in predicted.facts["segments"] if "number" in segment]
+        segments = predicted.facts.get("segments", ())
+        objects = [segment for segment in segments if "number" in segment]
         texts = {segment["number"]: text(segment) for segment in objects}
         return {"prediction": labels, "numbers": numbers, "objects": texts}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -77,13 +77,18 @@ def mixed_picture(
     light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     colors = class_colors(class_names)[labels]
     mixed = cv2.addWeighted(light, 0.5, colors, 0.5, 0)
-    for axis in (0, 1):
-        parts = labels if segments is None else segments
-        is_border = np.diff(parts, axis=axis, prepend=parts.take([0], axis)) != 0
-        mixed[is_border] = colors[is_border]
+    is_border = _borders(labels if segments is None else segments)
+    mixed[is_border] = colors[is_border]
     mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
     mixed[(labels == UNKNOWN) & ~rgb.any(axis=-1)] = UNKNOWN_COLOR
     return mixed
+
+
+def _borders(numbers: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Return True for pixels ``(H, W)`` that differ from the one above or to the left."""
+    across, down = (np.diff(numbers, axis=k, prepend=numbers.take([0], k)) != 0 for k in (0, 1))
+    borders: NDArray[np.bool_] = across | down
+    return borders
 
 
 def with_class_legend(
@@ -146,6 +151,7 @@ def prediction_panel(
     truth: NDArray[np.integer],
     prediction: NDArray[np.integer],
     class_names: tuple[str, ...],
+    segments: Sequence[NDArray[np.integer]] = (),
 ) -> _Image:
     """Draw input, ground truth, prediction and error in a 2 × 2 grid above a legend.
 
@@ -154,6 +160,7 @@ def prediction_panel(
         truth: True labels ``(H, W)``; 0 is unknown.
         prediction: Predicted labels ``(H, W)``.
         class_names: Names of the K + 1 labels.
+        segments: True and predicted numbers ``(H, W)``, between which borders are drawn.
 
     Returns:
         RGB image of about 2W × 2H; panoramas with less than 256 rows are enlarged by a whole
@@ -163,6 +170,8 @@ def prediction_panel(
     error = np.where((prediction == truth)[..., None], _RIGHT, _WRONG)
     error[truth == UNKNOWN] = UNKNOWN_COLOR
     tiles = {"input": rgb, "ground truth": colors[truth], "prediction": colors[prediction]}
+    for title, numbers in zip(("ground truth", "prediction"), segments, strict=False):
+        tiles[title][_borders(numbers)] = 0
     grid, labels = _grid(tiles | {"error": error.astype(np.uint8)}), np.stack([truth, prediction])
     return with_class_legend(grid, labels, class_names, {"correct": _RIGHT, "wrong": _WRONG})
 

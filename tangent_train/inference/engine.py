@@ -123,6 +123,13 @@ def _with_confidence(returned: Any) -> tuple[Tensor, Mapping[str, Tensor]]:
     return scores.float(), outputs
 
 
+def add_views(mosaic: Any, views: Any, scores: Tensor, outputs: Mapping[str, Any]) -> None:
+    """Add scores and objects of some views, see `scored_views`, to the mosaic of a head."""
+    mosaic.add(scores, views)
+    if "segments" in outputs and hasattr(mosaic, "add_segments"):
+        mosaic.add_segments(outputs["segments"], views)
+
+
 def upright_rays(
     sets: Iterable[Views], rotation: NDArray[np.float64] | None, device: torch.device | str
 ) -> Iterator[Tensor | None]:
@@ -320,9 +327,7 @@ class Predictor:
         count = sum(len(views) for views, _, _ in sets)
         joins = getattr(self._loaded.network, "takes_all_views", False)
         for views, scores, outputs in scored_views(network, sets, per_forward, joins):
-            mosaic.add(scores, views)
-            if "segments" in outputs and hasattr(mosaic, "add_segments"):
-                mosaic.add_segments(outputs["segments"], views)
+            add_views(mosaic, views, scores, outputs)
             if "rotation_error_deg" in outputs:
                 mosaic.facts["rotation_error_deg"] = outputs["rotation_error_deg"]
             progress(len(views) / count)

@@ -6,6 +6,8 @@ and predictions do not need it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Integer
@@ -16,6 +18,8 @@ from torchmetrics.classification import MulticlassConfusionMatrix
 from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.metrics.depth import SUMS, WEIGHTINGS, error_sums
+from tangent_train.metrics.panoptic import SUBSETS, panoptic_sums
+from tangent_train.metrics.panoptic import SUMS as SEGMENT_SUMS
 from tangent_train.metrics.scores import BAND_EDGES_DEG
 from tangent_train.metrics.segmentation import SegmentationCounts, count_image
 from tangent_train.metrics.sphere import REGIONS, SEAM_SUMS
@@ -45,6 +49,10 @@ class ImagesMetric(Metric):
         for name, shape in self._shapes.items():
             empty = torch.zeros((0, *shape), dtype=torch.float64, device=self.device)
             setattr(self, name, [empty])
+
+    def compute(self) -> Any:
+        """Return the numbers ``(images, …)`` of all processes."""
+        return dim_zero_cat(self.of_images).cpu().numpy()
 
 
 class SegmentationMetric(ImagesMetric):
@@ -104,7 +112,20 @@ class DepthMetric(ImagesMetric):
         """Add the errors of one image, see `error_sums`."""
         self.of_images.append(error_sums(prediction, truth)[None])
 
-    def compute(self) -> NDArray[np.float64]:
-        """Return the sums ``(images, 13, 10)`` of all processes."""
-        sums: NDArray[np.float64] = dim_zero_cat(self.of_images).cpu().numpy()
-        return sums
+
+class PanopticMetric(ImagesMetric):
+    """Collects the sums of the segments of all panoramas of a data set, see `panoptic_sums`.
+
+    Args:
+        num_classes: K + 1, the unknown class 0 included.
+    """
+
+    def __init__(self, num_classes: int) -> None:
+        super().__init__(of_images=(2, len(SUBSETS), num_classes - 1, len(SEGMENT_SUMS)))
+        self.num_classes = num_classes
+
+    def update(self, prediction: Tensor, truth: Tensor) -> None:
+        """Add the panoptic maps of one panorama."""
+        maps = prediction.cpu().numpy(), truth.cpu().numpy()
+        sums = torch.from_numpy(panoptic_sums(*maps, self.num_classes))
+        self.of_images.append(sums[None].to(truth.device))

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from tangent_train.metrics.panoptic import panoptic_scores
 from tangent_train.metrics.scores import Interval, by_solid_angle, defined_mean
 
 AbsentClass = Literal["skip", "zero"]
@@ -23,8 +24,9 @@ AbsentClass = Literal["skip", "zero"]
 
 Sums = Mapping[str, NDArray[np.float64]]
 """Numbers of images ``(images, …)``, or their sums. Of classes: ``pixels``, and of panoramas
-``solid_angle``, ``regions`` and ``seam``, see `SegmentationCounts`. Each other score has two
-numbers: its value and 1, or 0 and 0 if it is undefined."""
+``solid_angle``, ``regions`` and ``seam``, see `SegmentationCounts`. Of panoptic maps: ``things``
+and ``stuff``, see `panoptic_scores`. Each other score has two numbers: its value and 1, or 0 and 0
+if it is undefined."""
 
 
 def as_sums(scores: Mapping[str, Float[np.ndarray, " images"]]) -> Sums:
@@ -45,6 +47,8 @@ def scores_of_sums(sums: Sums, absent_class: str = "skip") -> dict[str, NDArray[
     Returns:
         Scores by name; NaN where they are undefined.
     """
+    if "things" in sums:
+        return panoptic_scores(sums["things"], sums["stuff"])
     of_classes = "pixels", "solid_angle", "regions", "seam"
     pairs = {name: of for name, of in sums.items() if name not in of_classes}
     numbers = {name: np.where(of[..., 1] > 0, of[..., 1], np.nan) for name, of in pairs.items()}

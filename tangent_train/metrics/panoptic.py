@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_solid_angles
+from tangent_train.metrics.scores import by_solid_angle, defined_mean
 from tangent_train.metrics.sphere import row_weights
 
 LABEL = 1 << 16
@@ -101,3 +102,22 @@ def quality(sums: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
             "sq": np.where(total > 0, iou / np.maximum(matched, 1), np.nan),
             "rq": np.where(total > 0, matched / total, np.nan),
         }
+
+
+def panoptic_scores(
+    things: NDArray[np.float64], stuff: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """Return means over the classes, given sums ``(…, 2, 3, classes, 4)`` of `panoptic_sums`.
+
+    Classes without segments are left out. The PQ of objects at seam and poles, see `SUBSETS`, is by
+    solid angle.
+    """
+    pixels, angles = np.moveaxis(np.concatenate([things, stuff], axis=-2)[..., 0, :, :], -3, 0)
+    of_things, of_stuff = (_means(of[..., 0, 0, :, :])["pq"] for of in (things, stuff))
+    seam, poles = np.moveaxis(_means(things[..., 1, 1:, :, :])["pq"], -1, 0)
+    parts = {"pq_things": of_things, "pq_stuff": of_stuff, "pq_seam": seam, "pq_poles": poles}
+    return _means(pixels) | by_solid_angle(_means(angles)) | parts
+
+
+def _means(sums: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    return {name: defined_mean(of_classes) for name, of_classes in quality(sums).items()}

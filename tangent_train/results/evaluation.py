@@ -283,7 +283,7 @@ def _mean(result: EvaluationResult, name: str) -> str:
 
 
 def _is_shown(result: EvaluationResult, name: str) -> bool:
-    """Return False for a score by solid angle of photos."""
+    """Return False for a score by solid angle of photos, over all of them."""
     return bool(result.latitude_bands) or not name.endswith(SOLID_ANGLE)
 
 
@@ -297,9 +297,10 @@ def _over_all(result: EvaluationResult, title: str = "Scores", *, of_sphere: boo
 
 
 def _per_class(result: EvaluationResult) -> Table:
-    names = [n for n in result.classes[0] if n != "class" and _is_shown(result, n)]
+    names = [n for n in result.classes[0] if n != "class"]
     columns = {n: result.columns[mean] for n, mean in result.class_means.items()}
-    predicted = np.sum(result.confusion, axis=0)[-len(result.classes) :]
+    none = np.zeros((1, len(result.classes)), np.int64)
+    predicted = np.sum(result.confusion or none, axis=0)[-len(result.classes) :]
     rows = [
         [entry["class"]]
         + [

@@ -19,7 +19,7 @@ from datamodules.core.dataset import Sample, valid_mask
 from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.errors import SettingError
 from tangent_train.heads import Head
-from tangent_train.inference.engine import scored_views, sees_rays, upright_rays
+from tangent_train.inference.engine import add_views, scored_views, sees_rays, upright_rays
 from tangent_train.tasks.divergence import check_loss, check_weights
 from tangent_train.tasks.optimization import Schedule, freeze, parameter_groups
 
@@ -452,7 +452,7 @@ class PixelTask(Task):
         mosaic = self.head.mosaic(shape, self.representation.blend, valid=valid, **how)
         view_sets = zip(sets, readers, rays, strict=True)
         for views, scores, outputs in self._evaluated_views(view_sets):
-            mosaic.add(scores, views)
+            add_views(mosaic, views, scores, outputs)
             if truth is not None and not self.is_tested:
                 lengths = torch.from_numpy(views.ray_lengths()).to(scores.device)
                 targets = self.head.targets(_labels_of_views(truth, views), lengths)

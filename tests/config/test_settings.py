@@ -95,7 +95,7 @@ def test_a_single_value_is_a_list_and_paths_are_paths() -> None:
     settings = composed_settings("keypoints", "output=a b", "base_level=1")
     assert settings.base_level == (1,)
     assert settings.output == Path("a b")
-    assert composed_settings("predict", *GIVEN["predict"], "mask=-60").mask == -60
+    assert composed_settings("predict", *GIVEN["predict"], "mask=-60").mask == (-60,)
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*/*.yaml")), ids=lambda path: path.stem)
