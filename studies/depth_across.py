@@ -14,8 +14,10 @@ from tangent_train.heads.scales import frame_scales, pose_scales
 from tangent_train.io.pixel_files import read_depth_m
 from tangent_train.rendering.resampling import resize
 
-COLUMNS = ("smooth error %", "step before %", "step %", "ratio error %", "unit error %")
-COLUMNS += ("ratio error of frames %",)
+COLUMNS = (
+    *("smooth error %", "step before %", "step %", "ratio error %", "unit error %"),
+    "ratio error of frames %",
+)
 
 
 def main() -> None:

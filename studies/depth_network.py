@@ -269,7 +269,8 @@ def picture(loaded: LoadedNetwork, panorama: Panorama, given: Mapping[str, Any])
     limits = distance_limits(known)
     tiles["room layout"] = colorize_distance(known, limits)
     for title, kind in (("camera ignored", "metric_z"), ("camera used", "canonical_z")):
-        of_kind: Any = replace(loaded, depth_kind=kind)
+        changes: Any = {"depth_kind": kind}
+        of_kind = replace(loaded, **changes)
         predictor = Predictor(of_kind, head_of(of_kind), ViewSelector(of_kind, **given))
         found = predictor.predict(panorama.image).pixels().numpy()
         tiles[title] = colorize_distance(found, limits)
@@ -300,7 +301,9 @@ def main() -> None:
     of_homes = [panorama for panorama in panoramas if panorama.group != "rooms"]
     if of_homes:
         drawn = picture(loaded, of_homes[_PICTURED], {"views": "horizontal"})
-        write_bytes(FOLDER / "depth_network.jpg", cv2.imencode(".jpg", drawn[..., ::-1])[1])
+        write_bytes(
+            FOLDER / "depth_network.jpg", cv2.imencode(".jpg", drawn[..., ::-1])[1].tobytes()
+        )
     save("depth_network", table(found))
     save("depth_network_scales", scales(ratios))
 

@@ -134,7 +134,8 @@ def picture(seed: int = 3) -> Figure:
     shown = [np.bincount(items[found.numbers == k]).argmax() + 1 for k in range(1, count + 1)]
     first = sets[0][0]
     figure = Figure((9, 5.4), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=[1, 1.25])
+    parts: Any = figure.subfigures(2, 1, height_ratios=[1, 1.25])
+    top, bottom = parts
     for axes, number in zip(top.subplots(1, 3), first.chosen[:3], strict=True):
         (of_view,) = items_at(first.grid.directions([number]))
         axes.imshow(colors[np.where(classes[of_view] >= 0, of_view + 1, 0)])

@@ -100,7 +100,7 @@ def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
     def scores(views: Callable[[slice], torch.Tensor]) -> list[torch.Tensor]:
         sets = [(range(number), views, None)]
         parts = scored_views(trained.network, sets, per_forward)
-        return [part for _, part in parts]
+        return [part for _, part, _ in parts]
 
     def predicted(predictor: Predictor) -> None:
         predictor.predict(image).pixels()

@@ -29,7 +29,7 @@ class Difference:
 
 
 def difference(result: EvaluationResult, base: EvaluationResult) -> Difference | str:
-    """Return the difference of an evaluation from another, or the reason why there is none.
+    """Return the difference of an evaluation from another, or the reason why it is unknown.
 
     Args:
         result: The evaluation.

@@ -45,7 +45,7 @@ class Connected(nn.Module):
         return {"out": scores, "segments": [self._segments(image) for image in scores.argmax(1)]}
 
     def _segments(self, labels: Tensor) -> Segments:
-        numbers, classes = np.zeros(labels.shape, np.int32), []
+        numbers, classes = np.zeros(labels.shape, np.int32), list[int]()
         for label in (0, 1, 2):  # walls too, which are not things
             parts, count = ndimage.label(labels.numpy() == label)
             numbers[parts > 0] = parts[parts > 0] + len(classes)

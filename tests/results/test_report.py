@@ -151,7 +151,7 @@ def test_facts_in_which_runs_differ_are_columns_of_all_rows() -> None:
 
 
 def test_every_published_score_has_a_protocol_its_data_and_a_known_unit() -> None:
-    columns = ClassesHead.columns | DistanceHead.columns | ImageClassHead.columns
+    columns = {**ClassesHead.columns, **DistanceHead.columns, **ImageClassHead.columns}
     for line in published_lines():
         assert facts(line["protocol"])["data"] == line["data"]
         assert line["source"].startswith("https://")
