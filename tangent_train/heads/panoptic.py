@@ -143,7 +143,9 @@ class PanopticHead(ClassesHead):
 
     def read(self, file: Path) -> NDArray[np.int32]:
         """Read a panoptic map."""
-        return read_rgb(file, as_stored=True) @ np.array([1, _BYTE, LABEL], np.int32)
+        colors: Any = read_rgb(file, as_stored=True)
+        codes: NDArray[np.int32] = colors @ np.array([1, _BYTE, LABEL], np.int32)
+        return codes
 
     def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> RGB:
         """Color the labels, or overlay the image with them and the borders of objects."""

@@ -103,11 +103,11 @@ def check(folder: Path, pairs: list[tuple[Any, Any]], truths: list[NDArray[np.in
         np.testing.assert_array_equal(truth, expected)
     content = results(folder)
     per_class = {e["class"]: [e[name] for name in SCORES] for e in content["classes"]}
-    expected = expected_scores(pairs)
-    assert np.array([per_class[name] for name in NAMES]) == pytest.approx(expected)
+    numbers = expected_scores(pairs)
+    assert np.array([per_class[name] for name in NAMES]) == pytest.approx(numbers)
     scores = content["scores"]
-    assert [scores[name] for name in SCORES] == pytest.approx(expected.mean(axis=0))
-    assert scores["pq_things"] == pytest.approx(expected[1:, 0].mean())
+    assert [scores[name] for name in SCORES] == pytest.approx(numbers.mean(axis=0))
+    assert scores["pq_things"] == pytest.approx(numbers[1:, 0].mean())
     return scores
 
 
