@@ -16,6 +16,7 @@ from models.mapped import gnomonic_points as gnomonic_points
 from models.mapped import hexagonal_rings as hexagonal_rings
 from models.mapped import mapped_samples as mapped_samples
 from models.mapped import mesh_operators as mesh_operators
+from models.mask_rcnn import MaskRCNN as MaskRCNN
 from models.pretrained import initialize as initialize
 from models.pretrained import widen_stem as widen_stem
 from models.prompted import PromptedNetwork as PromptedNetwork

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.huggingface import architecture, image_processor_class
-from models.segments import Segments
+from models.segments import Segments, front_segments
 from tangent_train.errors import check_choice
 
 TEXT_CLASSES = {"clipseg": "CLIPSegForImageSegmentation", "sam3": "Sam3Model"}
@@ -110,16 +110,12 @@ class PromptedNetwork(nn.Module):
         return torch.stack(logits, dim=1), segments
 
     def _segments(self, found: Sequence[Any], size: tuple[int, int]) -> Segments:
-        """Return the objects of one image; where masks overlap, the best one is in front."""
+        """Return the objects of one image, see `front_segments`."""
         counts = torch.tensor([len(of["scores"]) for of in found])
         scores = torch.cat([of["scores"] for of in found])
         masks = torch.cat([of["masks"].reshape(-1, *size) for of in found]).bool()
         prompts = torch.tensor(self._class_of_prompt).repeat_interleave(counts).to(scores.device)
-        order = scores.argsort()
-        numbers = torch.zeros(size, dtype=torch.int32, device=scores.device)
-        for number, mask in enumerate(masks[order], start=1):
-            numbers[mask] = number
-        return Segments(numbers, prompts[order], scores[order])
+        return front_segments(masks, prompts, scores)
 
 
 def text_network(config: Mapping[str, Any]) -> Any:

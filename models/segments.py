@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 
@@ -19,3 +20,18 @@ class Segments(NamedTuple):
     numbers: Tensor
     classes: Tensor
     scores: Tensor
+
+
+def front_segments(masks: Tensor, classes: Tensor, scores: Tensor) -> Segments:
+    """Return objects in ascending order of scores; where masks overlap, the best one is in front.
+
+    Args:
+        masks: ``(m, h, w)`` True inside the object.
+        classes: ``(m,)`` int64 index of the class.
+        scores: ``(m,)`` confidence.
+    """
+    order = scores.argsort()
+    numbers = torch.zeros(masks.shape[1:], dtype=torch.int32, device=scores.device)
+    for number, mask in enumerate(masks[order], start=1):
+        numbers[mask] = number
+    return Segments(numbers, classes[order], scores[order])

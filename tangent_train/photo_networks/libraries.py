@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ from torchvision import models
 from torchvision.models import WeightsEnum
 
 from datamodules.core.inputs import Normalization
+from datamodules.core.label_map import UNKNOWN_NAME
+from models.mask_rcnn import MASK_RCNNS
 from models.onnx_network import OnnxNetwork
 from models.pretrained import fetch_tensors, load_tensors, tensors_for
 from tangent_train.checkpoints.loaded import completed_settings
@@ -35,6 +37,12 @@ from tangent_train.photo_networks.network import (
 _AUXILIARY = "aux_classifier.", "classification_head."
 """Prefixes of the tensors of heads that are not used."""
 
+_NO_CLASS = "N/A"
+"""Name of labels of COCO that are not used."""
+
+_DETECTION_SIZE = (800, 800)
+"""Rows and columns of the images of Mask R-CNN: the shorter side in its training."""
+
 _LEFT_OUT = {"activation", "aux_params"}
 """Settings that are not used: the activation after the scores, and a classification head."""
 
@@ -45,27 +53,31 @@ def load_torchvision(
     classes: Path | None = None,
     normalization: Any = None,
 ) -> PhotoNetwork:
-    """Load a network of ``torchvision.models.segmentation``.
+    """Load a network of ``torchvision.models.segmentation``, or Mask R-CNN.
 
     Args:
         model: Name of the network.
         weights: Name of published weights, or a file with a state dict. By default a file has the
             classes and the normalization of the default weights.
-        classes: JSON file of the class names; None for the names of the weights.
+        classes: JSON file of the class names; None for the names of the weights. Of Mask R-CNN,
+            the first name is that of the background.
         normalization: See `Normalization.of`; None for that of the weights.
 
     Raises:
         DataError: The weights cannot be fetched or read, or do not fit.
         SettingError: There is no such model, or no such weights.
     """
-    check_choice("model", model, tuple(models.list_models(models.segmentation)))
+    check_choice("model", model, (*models.list_models(models.segmentation), *MASK_RCNNS))
     published = models.get_model_weights(model)
     is_file = weights is not None and Path(weights).is_file()
     if not is_file:
         check_choice("weights", weights, (*published.__members__, "a file"))
     chosen: WeightsEnum = published["DEFAULT" if is_file else weights]
-    preset: Any = chosen.transforms()
     names = tuple(chosen.meta["categories"]) if classes is None else class_names_in(classes)
+    if model in MASK_RCNNS:
+        file = Path(weights) if is_file else None
+        return _mask_rcnn(model, chosen, file, names, normalization)
+    preset: Any = chosen.transforms()
     settings = {
         "_target_": f"torchvision.models.segmentation.{model}",
         "num_classes": len(names),
@@ -85,6 +97,37 @@ def load_torchvision(
         normalization=default if normalization is None else Normalization.of(normalization, 3),
         image_size=(preset.resize_size[0], preset.resize_size[0]),
         score_kind="logits",
+    )
+
+
+def _mask_rcnn(
+    model: str, chosen: WeightsEnum, file: Path | None, names: Sequence[str], normalization: Any
+) -> PhotoNetwork:
+    """Load Mask R-CNN, which normalizes images itself; `file` None loads the published weights."""
+    labels = [k for k, name in enumerate(names) if k and name != _NO_CLASS]
+    colors = Normalization.of("imagenet" if normalization is None else normalization, 3)
+    settings = {
+        "_target_": "models.MaskRCNN",
+        "model": model,
+        "num_labels": len(names),
+        "labels": labels,
+        "image_mean": list(colors.mean),
+        "image_std": list(colors.std),
+    }
+    module: Any = build_from_config(settings, "network")
+    inner = module.network
+    tensors = fetch_tensors(str(chosen)) if file is None else tensors_for(inner, file)
+    load_tensors(inner, tensors, file or chosen)
+    classes = tuple(names[k] for k in labels)
+    return PhotoNetwork(
+        module=module,
+        settings=settings,
+        score_names=(*classes, UNKNOWN_NAME),
+        normalization=Normalization.of("unit", 3),
+        image_size=_DETECTION_SIZE,
+        score_kind="probabilities",
+        things=classes,
+        unknown=(UNKNOWN_NAME,),
     )
 
 

@@ -41,6 +41,7 @@ READ_FILES = (
     "depth",
     "back",
     "poses",
+    "align_across",
     "cameras",
     "classes",
 )
