@@ -122,7 +122,8 @@ class OutputNetwork(nn.Module):
         else:
             returned = dict(named_outputs(self.network(images, *arguments, **settings)))
         outputs = {n: _with_channels(returned[n]) for n in _MAPS if n in returned}
-        outputs["out"] = outputs["out"] * self._gain
+        if self._gain != 1:  # an operation less
+            outputs["out"] = outputs["out"] * self._gain
         if tile != size:
             outputs = {name: _resized(values, size) for name, values in outputs.items()}
         if self.takes_cameras and "world_from_camera" in returned:

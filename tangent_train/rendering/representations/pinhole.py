@@ -414,7 +414,7 @@ def covering_rings(fov_deg: tuple[float, float], overlap: float) -> list[dict[st
         overlap: Least overlap of neighbors as a share of a view, from 0 to less than 1.
 
     >>> covering_rings((62, 48), 0.1)[:2]
-    [{'pitch': 0.0, 'views': 7}, {'pitch': 43.2, 'views': 6}]
+    [{'pitch': 0.0, 'views': 8}, {'pitch': 43.2, 'views': 8}]
     """
     step = fov_deg[1] * (1 - overlap)
     rings: list[dict[str, float]] = []
