@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torchvision.models import get_model
 
 from models.segments import Segments, front_segments
 
@@ -43,6 +42,8 @@ class MaskRCNN(nn.Module):
         **settings: Any,
     ) -> None:
         super().__init__()
+        from torchvision.models import get_model  # seconds to import
+
         self._labels, self._threshold = list(labels), threshold
         given = {"weights": None, "weights_backbone": None, "num_classes": num_labels} | settings
         self.network = get_model(model, **given)

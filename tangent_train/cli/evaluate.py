@@ -88,7 +88,7 @@ def _unlabeled(settings: EvaluateSettings, loaded: LoadedNetwork) -> Any:
     inputs = Inputs.find(str(settings.input))
     jobs = list(inputs.jobs(inputs.names))
     return SimpleNamespace(
-        noun="panoramas" + " without depth" * ("depth" in loaded.inputs),
+        noun="panoramas" + " without depth" * ("depth" in loaded.inputs), labels="",
         splits=lambda: {"test": jobs}, groups=lambda _: (), folds=(),
         facts={"data": str(settings.input)}, class_names=loaded.class_names,
         representation=build_from_config(settings.representation or {}, "representation"),
