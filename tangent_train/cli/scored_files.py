@@ -6,6 +6,7 @@ import csv
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
 from typing import Any
@@ -146,8 +147,9 @@ class Variants:
         for name, change in self._changes.items() if place in self._compared else ():
             self._metrics[name].update(self._head.comparable(change(prediction), truth), truth)
 
+    @cached_property
     def scores(self) -> dict[str, float]:
-        """Return the main score of each variant."""
+        """Main score of each variant, after all updates."""
         of_metrics = {name: metric.compute() for name, metric in self._metrics.items()}
         main = self._head.main_score
         return {name: self._head.scores(of).means[main] for name, of in of_metrics.items()}
@@ -155,14 +157,14 @@ class Variants:
     def table(self) -> Table:
         """Return the table of the scores."""
         column = self._head.columns[self._head.main_score]
-        rows = [(name, score_text(score, column.unit)) for name, score in self.scores().items()]
+        rows = [(name, score_text(score, column.unit)) for name, score in self.scores.items()]
         return Table(
             f"With usual mistakes undone, on {self.images}", ("predictions", column.title), rows
         )
 
     def warning(self) -> str:
         """Return a warning if a variant is better by a margin; else ""."""
-        column, scores = self._head.columns[self._head.main_score], self.scores()
+        column, scores = self._head.columns[self._head.main_score], self.scores
         best = min if column.better == "lower" else max
         name = best(scores, key=lambda name: scores[name])
         if not abs(scores[name] - scores[_AS_THEY_ARE]) > _NOTED:

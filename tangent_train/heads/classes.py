@@ -267,18 +267,23 @@ class ClassesHead(Head):
         """Read labels."""
         return read_pixels(file, indices=True)
 
+    def labels_in(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the labels of predicted pixels."""
+        return pixels
+
     def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> RGB:
         """Color the labels, or overlay the image with them."""
         if kind == "color":
-            return class_colors(self.class_names)[pixels]
-        return pictures.mixed_picture(rgb, pixels, self.class_names)
+            return class_colors(self.class_names)[self.labels_in(pixels)]
+        return pictures.mixed_picture(rgb, self.labels_in(pixels), self.class_names, pixels)
 
     def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> RGB:
         """Return a picture; an overlay has a legend of the classes."""
         painted = self.paint(kind, rgb, pixels)
         if kind == "color":
             return painted
-        return pictures.with_class_legend(painted, pixels[pixels > 0], self.class_names)
+        labels = self.labels_in(pixels)
+        return pictures.with_class_legend(painted, labels[labels > 0], self.class_names)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return the share of the solid angle of each class; 0 if everything is masked."""

@@ -147,19 +147,9 @@ class PanopticHead(ClassesHead):
         codes: NDArray[np.int32] = colors @ np.array([1, _BYTE, LABEL], np.int32)
         return codes
 
-    def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> RGB:
-        """Color the labels, or overlay the image with them and the borders of objects."""
-        labels = pixels // LABEL
-        if kind == "color":
-            return super().paint(kind, rgb, labels)
-        return pictures.mixed_picture(rgb, labels, self.class_names, pixels)
-
-    def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> RGB:
-        """Return a picture; an overlay has a legend of the classes."""
-        painted, labels = self.paint(kind, rgb, pixels), pixels // LABEL
-        if kind == "color":
-            return painted
-        return pictures.with_class_legend(painted, labels[labels > 0], self.class_names)
+    def labels_in(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the labels of a panoptic map."""
+        return pixels // LABEL
 
     def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
         """Return labels, numbers of objects, and their descriptions, which evaluations lack."""

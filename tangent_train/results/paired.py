@@ -20,7 +20,7 @@ class Difference:
     Attributes:
         images: Number of these images.
         scores: Differences of the scores by name, if they are defined.
-        intervals: Their 95 % bootstrap intervals over the images, see `metrics.image_sums`.
+        intervals: 95 % bootstrap intervals of the differences, see `metrics.image_sums`.
     """
 
     images: int
