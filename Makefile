@@ -31,7 +31,7 @@ demo: install
 		echo "Going on with the interrupted demo …"; \
 		$(BIN)/tangent-train resume=$(DEMO) || { $(AGAIN); }; \
 	else \
-		echo "Rendering rooms, training and evaluating (3 to 4 minutes on two cores) …"; \
+		echo "Rendering rooms, training and evaluating (3 to 5 minutes on two cores) …"; \
 		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO) || { $(AGAIN); }; \
 	fi
 
