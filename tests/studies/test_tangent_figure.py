@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from studies.tangent_figure import tangent_figure
 from tangent_train.geometry import TangentGrid, equirect_directions, random_rotation
-from tangent_train.rendering.figure import tangent_figure
 
 TOP = 800
 
