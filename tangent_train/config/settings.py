@@ -102,9 +102,6 @@ class ImageSettings(Settings):
     area: tuple[float, float, float, float] | None = None
     """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
     sphere"""
-    eye: Literal["left", "right"] | None = None
-    """stereo panoramas (two pictures above or beside each other): left | right; null = not
-    stereo"""
 
 
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
@@ -198,7 +195,7 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 class RenderSettings(ImageSettings):
     """Settings of tangent-render."""
 
-    not_content = ("figure", "output", "overwrite")
+    not_content = ("output", "overwrite")
 
     # --- input ---
     input: str | Path | None = None
@@ -242,11 +239,9 @@ class RenderSettings(ImageSettings):
     output: Path | None = None
     """folder for the tangent images; with back=, the file of the panorama"""
     overwrite: bool = False
-    """true: replace an existing file of figure=, poses=, or back= with one panorama"""
+    """true: replace an existing file of poses=, or of back= with one panorama"""
     format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
-    figure: Path | None = None
-    """PNG file of the first panorama and its tangent images; output is then optional"""
 
     # --- COLMAP ---
     colmap: bool = False
@@ -514,6 +509,14 @@ class FilesSettings(RunSettings):
     depth_channel: str | None = None
     """predictions: channel of OpenEXR files; null = as tangent-predict"""
 
+    @model_validator(mode="after")
+    def _check_predictions(self) -> Self:
+        """Refuse settings that are read with predictions only."""
+        if self.predictions is None:
+            of_files = {"values", "files", "resample", "depth_scale", "depth_channel"}
+            check_read(self, type(self).model_fields.keys() - of_files)
+        return self
+
 
 class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
     """Settings of tangent-evaluate."""
@@ -545,6 +548,14 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
     """views of a panorama that the network receives; null = as in the checkpoint"""
     level: Level | None = None  # type: ignore[assignment]
     """level s, the angular resolution; null = as in the checkpoint"""
+
+    @model_validator(mode="after")
+    def _check_network(self) -> Self:
+        """Refuse an evaluation of nothing."""
+        if self.checkpoint is None and self.predictions is None:
+            expected = "a network, or predictions=<folder>"
+            raise SettingError("checkpoint", found="null", expected=expected)
+        return self
 
 
 class PrepareSettings(RunSettings):
