@@ -558,14 +558,6 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
         return self
 
 
-class PrepareSettings(RunSettings):
-    """Settings of tangent-prepare."""
-
-    # --- performance ---
-    shard: str | int | None = None
-    """part of the cache for this process, e.g. 3/16; null = all"""
-
-
 class PhotoSettings(Settings):
     """Settings of the photos of a transfer."""
 
@@ -645,7 +637,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "render": RenderSettings,
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
-    "prepare": PrepareSettings,
+    "prepare": RunSettings,
     "check": FilesSettings,
 }
 """Settings by the name of the command."""

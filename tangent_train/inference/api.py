@@ -74,8 +74,6 @@ Depth = Tensor | NDArray[Any] | None
 _Stored = str | Path | Image.Image | NDArray[Any]
 """Pictures whose results are arrays."""
 
-_SHOWN = 6
-
 
 class ImageSettings(TypedDict, total=False):
     """Arguments of the methods of `Network` besides the image, see `Network.labels`."""
@@ -184,14 +182,6 @@ class Network:
         self.class_names = loaded.class_names
         self.palette = class_colors(tuple(loaded.class_names))
         self._predictor, self._up_likelihood = predictor, up_likelihood
-
-    def __repr__(self) -> str:
-        """Return classes or kind of depth, inputs and device in one line."""
-        loaded, names = self.loaded, self.class_names[1:]
-        shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
-        predicts = f"{len(names)} classes ({shown})" if names else f"depth ({loaded.depth_kind})"
-        inputs = ", ".join(loaded.inputs)
-        return f"<Network of {predicts}, inputs {inputs}, on {self._predictor.device}>"
 
     @overload
     def labels(self, image: Tensor, **settings: Unpack[LabelSettings]) -> Tensor: ...

@@ -179,17 +179,6 @@ def test_an_incomplete_test_leaves_no_results(
         (["+optimizer.x=1"], "optimizer: found .*argument 'x'"),
         (["+data.rooot=x"], "Did you mean data.root?"),
         (["network._target_=models.Absent"], "Absent"),
-        (
-            ["+callbacks.x={_target_: lightning.pytorch.callbacks.LearningRateFinder}"],
-            r"callbacks\.x: found LearningRateFinder; .*-m optimizer\.lr=",
-        ),
-        (
-            [
-                "+callbacks.x={_target_: lightning.pytorch.callbacks.StochasticWeightAveraging,"
-                " swa_lrs: 0.1}"
-            ],
-            r"callbacks\.x: found StochasticWeightAveraging; .*ema=",
-        ),
         (["task.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
     ],
 )
