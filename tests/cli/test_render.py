@@ -224,8 +224,6 @@ def test_level_views_come_back_in_place(tmp_path: Path, blend: str, refused: Ref
     np.save(tmp_path / "features" / "face_003.npy", np.zeros((20, 20, 3), np.float32))
     message = refused(output=tmp_path / "no.npy", **settings)
     assert "face_003.npy: found float32 of shape (20, 20, 3)" in message
-    given = {"views": views, "figure": "a.png"}
-    assert "figure: found" in refused(input=tmp_path / "room.png", **given)
     for changes in ({"views": "erp"}, {"views": views, "base_level": 0}):
         message = refused(input=tmp_path / "room.png", output=tmp_path / "no", **changes)
         assert "views: found" in message
@@ -288,14 +286,6 @@ def test_yaw_pitch_roll(
     assert found is not None
     np.testing.assert_allclose(found @ (1, 0, 0), forward, atol=1e-12)
     np.testing.assert_allclose(found @ (0, 1, 0), right, atol=1e-12)
-
-
-def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
-    figure = tmp_path / "figure.png"
-    render_with(input=room, figure=figure, base_level=0)
-    assert _read(figure).shape[1] == 1600
-    message = refused(input=room, figure=figure, output=tmp_path / "tan")
-    assert "figure.png, which exists" in message
 
 
 def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Refused) -> None:
