@@ -375,8 +375,8 @@ _IN = {"input": "in", "output": "tan"}
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "found none of them; expected input=<panoramas>, back="),
-        ({"input": "in"}, "found input; expected .* and output="),
+        ({"output": "o"}, "found none of them; expected input=<panoramas>, back="),
+        ({"input": "in"}, "Missing: output="),
         ({**_IN, "format": "gif"}, "format: found gif; expected 'png', "),
         (
             {**_IN, "interpolation": "nearest", "format": "jpg"},
