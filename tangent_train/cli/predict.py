@@ -6,7 +6,7 @@ import hashlib
 import math
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from tangent_train.cli import main
 from tangent_train.cli.one_scale import OneScale
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted, listed
+from tangent_train.errors import SettingError, counted, listed
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
 from tangent_train.inference import images
@@ -29,9 +29,6 @@ from tangent_train.inference.views import ViewSelector
 from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
-
-_COUNTED_IMAGES = 32
-"""Images whose confidences are counted for `min_share`, at most."""
 
 
 def predict(settings: PredictSettings) -> None:
@@ -55,8 +52,6 @@ def predict(settings: PredictSettings) -> None:
     missing = manifest.missing(shard.part(names))
     done = len(shard.part(names)) - len(missing)
     print_text(f"{counted(len(missing) + done, 'images')}, {done} done already.")
-    if missing:
-        prediction.count(inputs)
     prediction.shown = {names[k] for k in evenly_spread(settings.report, len(names))}
     errors = _work("Predicting", inputs, missing, manifest, prediction.predict, prediction)
     manifest = Manifest.open(settings.output, same)  # with what other shards have finished
@@ -173,20 +168,6 @@ class _Prediction:
                 raise SettingError("depth", found="null", expected=expected)
             of_file = settings.depth_scale, settings.depth_channel
             self._depth = images.DepthFolder(settings.depth, *of_file)
-
-    def count(self, inputs: Inputs) -> None:
-        """Let the head count in some of the images, see `Head.count`."""
-        names = inputs.names
-        chosen = [names[k] for k in evenly_spread(_COUNTED_IMAGES, len(names))]
-
-        def mosaics() -> Iterator[Any]:
-            for job in inputs.jobs(chosen):
-                with suppress(DataError, SettingError):  # reported when the image is predicted
-                    if not job.error:
-                        yield self._predictor.predict(self._upright(self.read(job)), averaged=True)
-
-        if line := self._head.count(mosaics()):
-            print_text(line)
 
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""

@@ -68,9 +68,9 @@ def render(settings: RenderSettings) -> None:
     """
     modes = [name for name in _MODES if getattr(settings, name) is not None]
     modes = ["input"] if settings.nerfstudio else modes
-    if len(modes) != 1 or settings.output is None:
+    if len(modes) != 1:
         found = " and ".join(modes) or "none of them"
-        expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>, and output="
+        expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>"
         remedy = "Example: tangent-render input=panoramas output=tangent"
         raise SettingError("input, back and poses", found=found, expected=expected, remedy=remedy)
     run, read = _MODES[modes[0]]
@@ -83,7 +83,7 @@ def render(settings: RenderSettings) -> None:
 def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     """Render panoramas to folders of tangent images, or to one project for COLMAP."""
     inputs = Inputs.find(settings.input or "", settings.every)
-    output, kind, suffix = settings.output or Path(), settings.interpolation, f".{settings.format}"
+    output, kind, suffix = settings.output, settings.interpolation, f".{settings.format}"
     if kind == "nearest" and suffix in LOSSY_SUFFIXES:
         expected = "png, tif or npy with interpolation=nearest: other formats change pixels"
         raise SettingError("format", found=settings.format, expected=expected)
@@ -240,7 +240,7 @@ def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
 
 def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
     """Write the poses of the panoramas from a model of COLMAP."""
-    model, output = settings.poses or Path(), settings.output or Path()
+    model, output = settings.poses or Path(), settings.output
     check_new(output, overwrite=settings.overwrite)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
     poses = poses_from(model, settings.cameras)
@@ -251,7 +251,7 @@ def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
 
 def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     """Render the results of one panorama to a file, or those of a folder of panoramas."""
-    back, output = settings.back or Path(), settings.output or Path()
+    back, output = settings.back or Path(), settings.output
     root = settings.cameras or back
 
     def write(folder: Path, cameras_file: Path, path: Path, *, adds_suffix: bool = False) -> None:

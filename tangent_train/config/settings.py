@@ -170,9 +170,6 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     (labels/, classes.json); null = none"""
     min_confidence: Share = 0
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
-    min_share: Share = 0
-    """keep at least this share of each class's pixels, the most confident ones, even below
-    min_confidence; measured on up to 32 images"""
     depth_format: Literal["png", "npy", "exr"] | None = None
     """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
     points: PositiveInt | None = None
@@ -236,10 +233,10 @@ class RenderSettings(ImageSettings):
     """single views: [width, height] in pixels, or one number; null = by level and fov"""
 
     # --- output ---
-    output: Path | None = None
+    output: Path
     """folder for the tangent images; with back=, the file of the panorama"""
     overwrite: bool = False
-    """true: replace an existing file of poses=, or of back= with one panorama"""
+    """true: replace an existing file of poses=, or back= with one panorama"""
     format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
 
@@ -419,8 +416,6 @@ class KeypointSettings(Settings):
     """folder for the results; the same settings continue interrupted ones"""
     pictures: NonNegativeInt = 2
     """number of pairs whose matches are drawn"""
-    export: bool = False
-    """true: write keypoints and matches as COLMAP databases"""
 
 
 class RunSettings(Settings):
