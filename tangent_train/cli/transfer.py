@@ -34,7 +34,6 @@ from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.checkpoints.outputs import network_for_views
-from tangent_train.cli import main
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.run import build_data
 from tangent_train.config.settings import SETTINGS, typed_names, typed_settings, validate
@@ -300,7 +299,3 @@ def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
     report.write(folder, name)
     report.print()
     print_text(f"Tables: {folder / name}.md, .csv")
-
-
-if __name__ == "__main__":
-    main.transfer()
