@@ -6,7 +6,7 @@ import hashlib
 import math
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -19,7 +19,7 @@ from tangent_train.cli import main
 from tangent_train.cli.one_scale import OneScale
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted, listed
+from tangent_train.errors import SettingError, counted, listed
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
 from tangent_train.inference import images
@@ -31,9 +31,6 @@ from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
 
-_COUNTED_IMAGES = 32
-"""Images whose confidences are counted for `min_share`, at most."""
-
 
 def predict(settings: PredictSettings) -> None:
     """Predict images and write the results.
@@ -43,7 +40,7 @@ def predict(settings: PredictSettings) -> None:
         DataError: The checkpoint cannot be read, or no images are found.
     """
     shard = Shard.parse(settings.shard)
-    inputs = Inputs.find(settings.input, settings.every, settings.eye, settings.area)
+    inputs = Inputs.find(settings.input, settings.every)
     prediction = _Prediction(settings)
     folder, names = prediction.folder, inputs.names
     content = settings.model_dump(mode="json", exclude={*settings.not_content})
@@ -56,8 +53,6 @@ def predict(settings: PredictSettings) -> None:
     missing = manifest.missing(shard.part(names))
     done = len(shard.part(names)) - len(missing)
     print_text(f"{counted(len(missing) + done, 'images')}, {done} done already.")
-    if missing:
-        prediction.count(inputs)
     prediction.shown = {names[k] for k in evenly_spread(settings.report, len(names))}
     errors = _work("Predicting", inputs, missing, manifest, prediction.predict, prediction)
     manifest = Manifest.open(settings.output, same)  # with what other shards have finished
@@ -178,20 +173,6 @@ class _Prediction:
             of_file = settings.depth_scale, settings.depth_channel
             self._depth = images.DepthFolder(settings.depth, *of_file)
 
-    def count(self, inputs: Inputs) -> None:
-        """Let the head count in some of the images, see `Head.count`."""
-        names = inputs.names
-        chosen = [names[k] for k in evenly_spread(_COUNTED_IMAGES, len(names))]
-
-        def mosaics() -> Iterator[Any]:
-            for job in inputs.jobs(chosen):
-                with suppress(DataError, SettingError):  # reported when the image is predicted
-                    if not job.error:
-                        yield self._predictor.predict(self._upright(self.read(job)), averaged=True)
-
-        if line := self._head.count(mosaics()):
-            print_text(line)
-
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""
         settings, image = self._settings, job.value or job.path
@@ -199,7 +180,7 @@ class _Prediction:
         depth = None if self._depth is None else partial(self._depth.read, stem)
         if settings.projection == "perspective":
             return images.read_photo(image, settings.fov, depth)
-        return images.read_panorama(image, settings.area, settings.upright, depth, settings.eye)
+        return images.read_panorama(image, settings.area, settings.upright, depth)
 
     def _upright(self, image: images.InputImage) -> images.InputImage:
         if self._settings.upright != "auto":
@@ -249,8 +230,6 @@ class _Prediction:
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         entry |= job.place
-        if self._settings.eye:
-            entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
         return entry | self._head.entry(predicted, is_counted)
@@ -275,7 +254,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
     names |= {"levels", "base_level", "blend", "write", "report", "shard"}
     names |= {"view_batch_size", "compile", "device", "trust"}
-    panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
+    panoramas = {"area", "fill", "views", "upright", "mask", "rotations"}
     if loaded.predicts == DISTANCE:
         panoramas |= {"align_across"}
     panoramas |= {"mask_classes"} if settings.mask is not None else set()
