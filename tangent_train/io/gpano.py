@@ -180,11 +180,10 @@ def read_area(
     left, width = (west + 180) / 360, _width_deg(west, east) / 360
     top, height = (90 - north) / 180, (north - south) / 180
     shown = f"square pixels in area={[west, east, south, north]}"
-    tags = read_tags(path) if tags is None else tags
+    tags = {} if angles else read_tags(path) if tags is None else tags
     if (stereo := tags.get("StereoMode", "mono")).lower() not in ("", "mono"):
         found = f"a stereo panorama ({stereo}), by its metadata"
         raise DataError(path, found=found, expected="one picture", remedy=remedy)
-    tags = {} if angles else tags
     if tags.keys() >= set(PART_TAGS) or not _is_equirect(tags):
         shown = f"square pixels in the part of its GPano tags, {tags}"
         left, width, top, height = _tagged_part(tags)

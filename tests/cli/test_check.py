@@ -10,6 +10,8 @@ import pytest
 
 from tangent_train.cli.check import check
 from tangent_train.cli.prepare import prepare
+from tangent_train.io import pixel_files
+from tangent_train.io.pixel_files import write_pixels
 from tests.datamodules.data_files import save_tagged, write_png
 from tests.datamodules.folder.folder_format import save, write_classes
 from tests.running import Capture, composed_settings
@@ -65,6 +67,19 @@ def test_stereo_panoramas_are_among_the_problems(root: Path, capsys: Capture, su
     assert ended.value.code
     out = " ".join(capsys.readouterr().out.split())
     assert f"b{suffix} a stereo panorama (left-right), by its metadata" in out
+
+
+def test_colors_of_12_bits_are_among_the_warnings(
+    root: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pixel_files, "_has_warned", bytearray(1))
+    monkeypatch.setenv("COLUMNS", "300")
+    write_pixels(root / "images" / "a.png", np.full((32, 64, 3), 4095, np.uint16))
+    classes = [None, "door", "wall", "floor", "sofa"]
+    write_classes(root, classes)
+    _out, err = _checked(root, capsys, "data.num_workers=0")
+    assert "a.png: the largest value of 16-bit colors is 4095" in err
+    assert "0 problems and 3 warnings; 3 panoramas of" in err
 
 
 def test_classes_of_other_labels(root: Path, capsys: Capture) -> None:
