@@ -76,12 +76,12 @@ class Run:
 
     def trainer(self, callbacks: Sequence[Callback] = ()) -> lightning.Trainer:
         """Build the trainer of the config, with further callbacks, and log the settings."""
-        settings = self.settings
+        settings, resumed = self.settings, getattr(self.settings, "resume", None)
         loggers = start_loggers(
             None if settings.trainer.get("fast_dev_run") else settings.logger,
             self.folder,
             evaluation.flat_settings(settings.model_dump(mode="json")),
-            is_resumed=getattr(settings, "resume", None) is not None,
+            resumed and self.folder / "checkpoints" / "last.ckpt",
         )
         panels = self.folder / "panels", settings.panels, settings.validation_images
         given = build_callbacks(settings, self.task)
