@@ -286,7 +286,7 @@ def _run(stage: Stage, settings: Mapping[str, Any], manifest: Manifest, heading:
 
 
 def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
-    """Write and print the tables."""
+    """Write and print the tables and the chart."""
     results: dict[Any, list[Any]] = defaultdict(list)
     for stage in stages:
         key = stage.changes["level"] if config.study_levels and stage.view else stage.name
@@ -299,7 +299,7 @@ def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
         name, report = "transfer", transfer_report(results, cells)
     report.write(folder, name)
     report.print()
-    print_text(f"Tables: {folder / name}.md, .csv")
+    print_text(f"Tables and a chart: {folder / name}.md, .csv, .png")
 
 
 if __name__ == "__main__":
