@@ -68,12 +68,23 @@ def _imported(folder: Path, command: str, *arguments: str, names: tuple[str, ...
     [
         ("train", ("--help",)),
         ("render", ("--help",)),
+        ("render", ("input=missing.jpg", "output=out")),
+        ("render", ("input=pano.png", "output=held")),
+        ("render", ("input=pano.png", "output=done", "views=cubemap")),
         ("predict", ("checkpoint=missing.ckpt", "input=pano.png", "output=out")),
+        ("predict", ("checkpoint=net.ckpt", "input=missing.jpg", "output=out")),
+        ("predict", ("checkpoint=net.ckpt", "input=pano.png", "output=held")),
+        ("export", ("checkpoint=net.ckpt", "output=pano.png")),
+        ("train", ("init_from=missing.ckpt",)),
     ],
 )
-def test_help_and_refused_settings_import_nothing_heavy(
+def test_help_and_refused_paths_import_nothing_heavy(
     tmp_path: Path, command: str, arguments: tuple[str, ...]
 ) -> None:
+    for name in ("pano.png", "net.ckpt", "held/notes.txt", "done/finished.jsonl"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text('{"item": "pano"}')
+    (tmp_path / "done" / "manifest.json").write_text('{"views": "horizontal"}')
     assert _imported(tmp_path, command, *arguments, names=_HEAVY) == set()
 
 
