@@ -39,7 +39,7 @@ def predict(settings: PredictSettings) -> None:
         DataError: The checkpoint cannot be read, or no images are found.
     """
     shard = Shard.parse(settings.shard)
-    inputs = Inputs.find(settings.input, settings.every)
+    inputs = Inputs.find(settings.input, settings.every, settings.eye, settings.area)
     prediction = _Prediction(settings)
     folder, names = prediction.folder, inputs.names
     content = settings.model_dump(mode="json", exclude={*settings.not_content})
@@ -176,7 +176,7 @@ class _Prediction:
         depth = None if self._depth is None else partial(self._depth.read, stem)
         if settings.projection == "perspective":
             return images.read_photo(image, settings.fov, depth)
-        return images.read_panorama(image, settings.area, settings.upright, depth)
+        return images.read_panorama(image, settings.area, settings.upright, depth, settings.eye)
 
     def _upright(self, image: images.InputImage) -> images.InputImage:
         if self._settings.upright != "auto":
@@ -217,6 +217,8 @@ class _Prediction:
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         entry |= job.place
+        if self._settings.eye:
+            entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
         return entry | self._head.entry(predicted, is_counted)
@@ -241,7 +243,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
     names |= {"levels", "base_level", "blend", "write", "report", "shard"}
     names |= {"view_batch_size", "compile", "device", "trust"}
-    panoramas = {"area", "fill", "views", "upright", "mask", "rotations"}
+    panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
     if loaded.predicts == DISTANCE:
         panoramas |= {"align_across"}
     panoramas |= {"mask_classes"} if settings.mask is not None else set()

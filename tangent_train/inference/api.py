@@ -54,7 +54,7 @@ from tangent_train.inference.images import (
     with_up,
 )
 from tangent_train.inference.views import Levels, ViewChoice, ViewSelector
-from tangent_train.io.gpano import Fill
+from tangent_train.io.gpano import Eye, Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
@@ -82,6 +82,7 @@ class ImageSettings(TypedDict, total=False):
     area: Sequence[float] | None
     upright: Upright
     mask: Mask | str | NDArray[Any] | Tensor
+    eye: Eye | None
 
 
 class LabelSettings(ImageSettings, total=False):
@@ -199,6 +200,7 @@ class Network:
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
+        eye: Eye | None = None,
     ) -> NDArray[Any] | Tensor:
         """Return the label of every pixel.
 
@@ -215,6 +217,7 @@ class Network:
             max_tilt_deg: Largest tilt that ``auto`` considers, in degrees.
             mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
                 a file; or 0 in an array or tensor. See `Masks`.
+            eye: Eye of a stereo panorama, see `eye_part`; the labels are those of its picture.
 
         Returns:
             ``(H, W)`` labels 1 … K, and 0 for unknown pixels: an array of uint8 (uint16 for many
@@ -225,7 +228,7 @@ class Network:
             SettingError: The image cannot be used, or the network needs another input.
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        given = self._read(image, depth, fov, area, upright, max_tilt_deg)
+        given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye)
         found = self._predictor.predict(given).pixels().cpu().numpy()
         if self.loaded.things:
             found = (found // LABEL).astype(np.uint8)
@@ -273,7 +276,7 @@ class Network:
         Args:
             image: A panorama, or a photo.
             mask: Pixels of a panorama that get NaN, see `labels`.
-            **settings: ``fov``, ``area`` and ``upright`` of `labels`. Of ``upright``, only
+            **settings: ``fov``, ``area``, ``upright`` and ``eye`` of `labels`. Of ``upright``, only
                 ``pose`` suits a depth network.
 
         Returns:
@@ -326,6 +329,7 @@ class Network:
         area: Sequence[float] | None = None,
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
+        eye: Eye | None = None,
     ) -> InputImage:
         """Return a photo, or a panorama with its zenith."""
         is_given = depth is not None or "depth" in self.loaded.inputs
@@ -334,7 +338,8 @@ class Network:
             return read_photo(image, fov, of_size)
         check_choice("upright", upright or "pose", ("pose", "auto"))
         check_type("max_tilt_deg", max_tilt_deg, Real, "degrees")
-        panorama = read_panorama(image, area, upright, of_size)
+        check_choice("eye", eye or "left", ("left", "right"))
+        panorama = read_panorama(image, area, upright, of_size, eye)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._up_likelihood)
         return panorama

@@ -14,12 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.io.gpano import PART_TAGS
+from tangent_train.io.gpano import PART_TAGS, read_area
 from tangent_train.io.videos import read_frames, read_video_size, read_video_tags, write_video
 from tests.datamodules.data_files import (
     hide_start,
     insert_boxes,
     projection_boxes,
+    spherical_v1,
     stereo_box,
 )
 
@@ -244,8 +245,12 @@ _PART = dict(zip(PART_TAGS, ("2", "1", "0.75", "0.75", "0.25", "0.25"), strict=T
         (_FLAT, dict.fromkeys(_POSE, "0.0")),
         (_TILE, _POSE | _PART),
         (stereo_box(0), {}),
-        (stereo_box(1), "pictures of two eyes"),
-        (stereo_box(2) + _TILE, "pictures of two eyes"),
+        (stereo_box(1), {"StereoMode": "top-bottom"}),
+        (stereo_box(2) + _TILE, {"StereoMode": "left-right"} | _POSE | _PART),
+        (stereo_box(4), {"StereoMode": "right-left"}),
+        (stereo_box(3), "stereo of mode 3"),
+        (projection_boxes(b"mshp"), "the projection mshp"),
+        (projection_boxes(b"cyli"), "the projection cyli"),
         (projection_boxes(b"cbmp"), "a cube map"),
     ],
 )
@@ -262,6 +267,41 @@ def test_layouts_that_the_metadata_state(
         return
     with pytest.raises(DataError, match=f"found a video with {tags}"):
         read_video_size(path)
+
+
+_HALF = dict(zip(PART_TAGS, ("256", "128", "128", "64", "64", "32"), strict=True))
+_STATED = {"Spherical": "true", "Stitched": "true", "ProjectionType": "equirectangular"}
+
+
+@pytest.mark.parametrize(
+    ("tags", "error"),
+    [
+        (_STATED | {"InitialViewPitchDegrees": "20"}, None),
+        (_STATED | _HALF, None),
+        (_STATED | {"StereoMode": "top-bottom"}, None),
+        (_STATED | {"StereoMode": "custom"}, "stereo of custom"),
+        (_STATED | {"Stitched": "false"}, "pictures that are not stitched"),
+    ],
+)
+def test_spherical_video_v1(tmp_path: Path, tags: dict[str, str], error: str | None) -> None:
+    """The first look of V1 is not the pose of the camera."""
+    path = _write(tmp_path / "a.mp4")
+    insert_boxes(path, spherical_v1(tags), (b"moov", b"trak"))
+    if error is None:
+        assert read_video_tags(path) == tags
+        area = read_area(path, (64, 128), tags=tags)
+        assert area.full_shape == ((128, 256) if _HALF.items() <= tags.items() else (64, 128))
+        return
+    with pytest.raises(DataError, match=f"found a video with {error}"):
+        read_video_size(path)
+
+
+@pytest.mark.parametrize("mode", ["left-right", "right-left", "top-bottom", "bottom-top"])
+def test_the_eyes_of_matroska(tmp_path: Path, mode: str) -> None:
+    def setup(stream: Any) -> None:
+        stream.metadata["stereo_mode"] = mode.replace("-", "_")
+
+    assert read_video_tags(_write(tmp_path / "a.mkv", setup=setup)) == {"StereoMode": mode}
 
 
 def _pq_nits(signal: NDArray[np.float64]) -> NDArray[np.float64]:
