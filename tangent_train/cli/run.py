@@ -14,8 +14,11 @@ import numpy as np
 import yaml  # type: ignore[import-untyped]
 from hydra.utils import get_class
 from lightning.pytorch.callbacks import (
+    BatchSizeFinder,
     Callback,
+    LearningRateFinder,
     LearningRateMonitor,
+    StochasticWeightAveraging,
 )
 from lightning.pytorch.callbacks import ProgressBar as LightningProgressBar
 from lightning.pytorch.utilities import rank_zero_only
@@ -50,6 +53,13 @@ from tangent_train.tasks.optimization import Schedule
 
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
+
+_REFUSED = {
+    LearningRateFinder: "Compare rates with a sweep: -m optimizer.lr=1e-3,1e-2",
+    BatchSizeFinder: "Try values of data.batch_size with debug=fast.",
+    StochasticWeightAveraging: "For an average of the weights: ema=0.999",
+}
+"""Callbacks of Lightning that change a training behind its settings."""
 
 
 @dataclass(frozen=True)
@@ -303,4 +313,7 @@ def build_callbacks(settings: RunSettings, task: Any) -> list[Any]:
         monitor = section.get("monitor") or task.monitor
         known = {"monitor": monitor, "mode": task.head.mode_of(monitor)}
         built.append(build_from_config(filled(section, known), f"callbacks.{name}"))
+        if remedy := _REFUSED.get(type(built[-1])):
+            found, expected = type(built[-1]).__name__, "a callback that can be resumed and tested"
+            raise SettingError(f"callbacks.{name}", found=found, expected=expected, remedy=remedy)
     return built

@@ -25,6 +25,7 @@ _MICROSECONDS = 10**6
 _MISSING_S = 0.5
 """Part of the declared duration that a whole video may lack: frames are not always as long."""
 
+_SHOWN_VP8 = 0x10
 _UPRIGHT_SIGNS = np.eye(2, dtype=np.int64)
 _SKEW = 0.02
 """Entries of a display matrix may differ from a quarter turn by this: one degree."""
@@ -106,7 +107,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
                 end_s = max(end_s, float(end))
             if packet.stream == stream:
                 packets += packet.size > 0
-                times += [packet.pts] if packet.size and not packet.is_discard else []
+                times += [packet.pts] if packet.size and _is_shown(packet) else []
                 first = first or next(iter(packet.decode()), None)
         if first is None:
             raise DataError(path, found="no frame that can be decoded", expected="a whole video")
@@ -212,6 +213,12 @@ def open_video(path: Path) -> Iterator[tuple[Any, Any]]:
 def _file_url(path: Path) -> str:
     # A bare name may select another protocol, e.g. "http:…".
     return f"file:{path.absolute()}"
+
+
+def _is_shown(packet: Any) -> bool:
+    """Return False for packets that an edit list hides and VP8 reference frames (RFC 6386, 9.1)."""
+    hidden = packet.stream.codec_context.name == "vp8" and not bytes(packet)[0] & _SHOWN_VP8
+    return not (packet.is_discard or hidden)
 
 
 def _display(path: Path, stream: Any, frame: Any) -> _Display:

@@ -37,7 +37,7 @@ _CODECS: dict[str, tuple[str, str, dict[str, str]]] = {
     "mjpeg": ("mjpeg", "yuvj420p", {}),
     "ffv1": ("ffv1", "yuv420p", {}),
     "prores": ("prores_ks", "yuv422p10le", {}),
-    "vp8": ("libvpx", "yuv420p", {}),
+    "vp8": ("libvpx", "yuv420p", {"lag-in-frames": "16", "auto-alt-ref": "1"}),
     "vp9": ("libvpx-vp9", "yuv420p", {"lag-in-frames": "16"}),
     "av1": ("libsvtav1", "yuv420p", {"preset": "12"}),
     "opengop": ("libx264", "yuv420p", {"g": "6", "x264-params": "open-gop=1:scenecut=0"}),
@@ -161,6 +161,21 @@ def test_frames_that_need_what_was_cut_off_do_not_count(tmp_path: Path, suffix: 
                 packet.stream = stream
                 output.mux(packet)
     assert 0 < len(_decoded(path)) < _COUNT
+    np.testing.assert_array_equal(_read(path), _decoded(path))
+
+
+def _hide(path: Path, number: int) -> None:
+    """Make a frame of VP8 one that is not shown: bit 4 of its first byte (RFC 6386, 9.1)."""
+    with av.open(str(path)) as container:
+        packet = [bytes(packet) for packet in container.demux(video=0)][number]
+    hidden = bytes([packet[0] & ~0x10]) + packet[1:]
+    path.write_bytes(path.read_bytes().replace(packet, hidden))
+
+
+def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8")
+    _hide(path, 5)
+    assert len(_decoded(path)) == _COUNT - 1
     np.testing.assert_array_equal(_read(path), _decoded(path))
 
 
@@ -383,7 +398,11 @@ def test_a_damaged_frame_is_an_error_after_those_before(tmp_path: Path, name: st
     np.testing.assert_array_equal(kept, whole[: len(kept)])
 
 
-def test_another_number_of_frames(tmp_path: Path) -> None:
+def test_a_video_without_a_frame_and_another_number_of_frames(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8", _pictures(1))
+    _hide(path, 0)
+    with pytest.raises(DataError, match=r"a\.mkv: found no frame that can be decoded"):
+        read_video_size(path)
     with pytest.raises(DataError, match="12 of 13 frames"):
         list(read_frames(_write(tmp_path / "b.mkv"), _COUNT + 1))
 
