@@ -166,8 +166,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """panoramas: pixels that become unknown (0): below a latitude (-60), black in a PNG file, or in
     a folder of one file per panorama; also several, e.g. [-60,tripod.png]; null = none"""
     mask_classes: OneOrMore[str] | None = None
-    """classes that become unknown, e.g. [sky], with mask= a folder that tangent-predict wrote
-    (labels/, classes.json); null = none"""
+    """classes that become unknown, e.g. [sky], with mask= the file of a network that predicts them,
+    or a folder that tangent-predict wrote (labels/, classes.json); null = none"""
     min_confidence: Share = 0
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
     depth_format: Literal["png", "npy", "exr"] | None = None
