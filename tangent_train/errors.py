@@ -231,6 +231,12 @@ def at_least(name: str, value: object, least: int, most: int | None = None) -> i
     return int(value)  # type: ignore[call-overload]
 
 
+def check_type(name: str, value: object, kinds: type | tuple[type, ...], expected: str) -> None:
+    """Raise TypeError unless an argument of the Python API is of one of some types."""
+    if not isinstance(value, kinds):
+        raise TypeError(f"{name}: found {type(value).__name__}; expected {expected}.")
+
+
 def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Raise SettingError unless a value is one of those allowed."""
     if value not in allowed:

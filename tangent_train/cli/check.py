@@ -6,6 +6,7 @@ import sys
 from contextlib import redirect_stdout
 
 from datamodules.core.label_map import label_doubts
+from tangent_train.cli import main
 from tangent_train.cli.run import open_data
 from tangent_train.cli.scored_files import check_files
 from tangent_train.config.settings import FilesSettings
@@ -61,3 +62,7 @@ def check(settings: FilesSettings) -> None:
     print_text(f"{summary}; {checked}.", error=bool(listed or warnings) and not terminal)
     if listed:
         sys.exit(1)
+
+
+if __name__ == "__main__":
+    main.check()

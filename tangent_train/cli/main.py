@@ -7,6 +7,7 @@ misspelled override return immediately.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
@@ -33,12 +34,16 @@ def _errors_as_messages(command: str) -> Iterator[None]:
 
         message = explained(error, command) or " ".join(str(error).split())
         sys.exit(printable(f"tangent-{command}: {message}"))
-    except (DataError, SettingError, MemoryError, OSError) as error:
+    except MemoryError as error:
+        remedy = "Choose smaller images or fewer at once."
+        sys.exit(f"tangent-{command}: not enough memory. {error}. {remedy}")
+    except (DataError, SettingError, OSError) as error:
         sys.exit(printable(f"tangent-{command}: {error}"))
     except Exception as error:
-        # Of Lightning, and of Hydra for data=5.
-        text, is_known = str(error), type(error).__name__ == "MisconfigurationException"
-        if not is_known and "group override" not in text:
+        # Of Hydra for data=5, of Optuna if all runs fail, of Lightning.
+        text, kind = " ".join(str(error).split()), type(error).__name__
+        known = kind == "ValueError" and re.search("group override|No trials are completed", text)
+        if not known and kind != "MisconfigurationException":
             raise
         sys.exit(printable(f"tangent-{command}: {text}"))
     except KeyboardInterrupt:
@@ -130,6 +135,18 @@ def report() -> None:
         write_report(with_help(sys.argv[1:]))
 
 
+def overview() -> None:
+    """Print the commands of the package, for ``python -m tangent_train``."""
+    _print_version("train")
+    from tangent_train.config.help import description
+    from tangent_train.files import config_folder
+
+    files = [path for path in sorted(config_folder().glob("*.yaml")) if path.stem != "run"]
+    lines = [description(path)[0] for path in files]
+    lines.append("tangent-report compares finished runs, also with published scores.\n")
+    sys.stdout.write("\n".join([*lines, "--help explains the settings of a command.\n"]))
+
+
 train = partial(_main, "train")
 evaluate = partial(_main, "evaluate")
 prepare = partial(_main, "prepare")
@@ -140,3 +157,6 @@ render = partial(_main, "render")
 export = partial(_main, "export")
 import_network = partial(_main, "import")
 keypoints = partial(_main, "keypoints")
+
+if __name__ == "__main__":
+    overview()

@@ -15,6 +15,7 @@ import numpy as np
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.folder.class_masks import mask_reader
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
+from tangent_train.cli import main
 from tangent_train.cli.one_scale import OneScale
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
@@ -265,3 +266,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     return names | (
         {"depth", "depth_scale", "depth_channel"} if "depth" in loaded.inputs else set()
     )
+
+
+if __name__ == "__main__":
+    main.predict()

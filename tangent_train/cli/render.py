@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from datamodules.folder.class_masks import mask_reader
+from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
@@ -308,3 +309,6 @@ _OF_NERFSTUDIO = {"poses", "cameras", "depth", "depth_scale"}
 """Settings that are read with colmap=true or nerfstudio=true, and with the latter only."""
 
 _SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
+
+if __name__ == "__main__":
+    main.render()

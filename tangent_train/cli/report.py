@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from tangent_train.cli import main
 from tangent_train.console import print_text
 
 
@@ -39,3 +40,7 @@ def report(arguments: Sequence[str]) -> None:
     runs.write(options.output, "report")
     runs.print()
     print_text(f"Files: {options.output}/report.*")
+
+
+if __name__ == "__main__":
+    main.report()

@@ -34,6 +34,7 @@ from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.checkpoints.outputs import network_for_views
+from tangent_train.cli import main
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.run import build_data
 from tangent_train.config.settings import SETTINGS, typed_names, typed_settings, validate

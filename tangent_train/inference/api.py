@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
@@ -26,6 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import PositiveInt
 from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps
@@ -37,7 +39,8 @@ from datamodules.core.label_map import (
     read_label_map,
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.errors import SettingError, check_choice, width_height
+from tangent_train.config.build import checks_types
+from tangent_train.errors import SettingError, at_least, check_choice, check_type, width_height
 from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
@@ -57,7 +60,7 @@ from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
 from tangent_train.metrics.panoptic import LABEL
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
-from tangent_train.rendering.forward import check_panorama
+from tangent_train.rendering.forward import check_grid, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic, blend_back
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.resampling import Pixels, reduce_to_pitch
@@ -89,6 +92,7 @@ class LabelSettings(ImageSettings, total=False):
     max_tilt_deg: float
 
 
+@checks_types
 def load(
     path: str | Path,
     *,
@@ -98,10 +102,10 @@ def load(
     levels: Levels = None,
     base_level: int | None = None,
     blend: Blend = "feather",
-    rotations: int = 1,
+    rotations: PositiveInt = 1,
     views: ViewChoice = None,
     fill: Fill | None = None,
-    view_batch_size: int | None = None,
+    view_batch_size: PositiveInt | None = None,
     compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
     min_confidence: float = 0.0,
     align: Align | None = None,
@@ -142,6 +146,7 @@ def load(
         DataError: A file cannot be used.
         SettingError: A setting does not suit the network.
     """
+    check_type("path", path, (str, Path), "the path of a network's file")
     original = loaded = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
     if label_map is not None:
         loaded = map_classes(original, load_label_map(label_map), unmapped).loaded
@@ -422,8 +427,12 @@ def apply(
     >>> apply(brightness, np.full((32, 64, 3), 0.5), TangentGrid(0, 4))[0, 0]
     np.float32(0.5)
     """
+    check_type("function", function, Callable, "a function of images")  # type: ignore[arg-type]
+    check_grid(grid)
     blend = blend_back(grid, blend)
     check_panorama(panorama, "bilinear")
+    if images_per_call is not None:
+        at_least("images_per_call", images_per_call, 1)
     step = images_per_call or views_per_forward(grid.size)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     shape, views = (rows, columns), PinholeViews(grid)
@@ -501,6 +510,7 @@ def load_label_map(given: str | Path) -> LabelMap:
         SettingError: There is no map of this name.
         DataError: The file is missing or is not a valid label map.
     """
+    check_type("label_map", given, (str, Path), "a name or a path")
     return read_label_map(label_map_file(given))
 
 

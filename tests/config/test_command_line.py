@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 import tangent_train
-from tangent_train.cli import processes
+from tangent_train.cli import main, processes
 from tests.cli.tiny_runs import run_command
 from tests.config.test_settings import GIVEN
-from tests.running import Capture, Patch, composed_settings
+from tests.running import Capture, Patch, composed_settings, run_python
 
 UNREAD = "expected no such setting: tangent-evaluate does not read it."
 
@@ -148,6 +149,24 @@ def test_every_command_prints_the_version(
     expected = version("tangent-train")
     assert capsys.readouterr().out == f"tangent-{command} {expected}\n"
     assert tangent_train.__version__ == expected
+
+
+def test_the_package_lists_its_commands(monkeypatch: Patch, capsys: Capture) -> None:
+    monkeypatch.setattr(sys, "argv", ["tangent_train"])
+    main.overview()
+    printed = capsys.readouterr().out
+    commands = {line.split()[0] for line in printed.splitlines() if line.startswith("tangent-")}
+    scripts = Path(tangent_train.__file__).parents[1] / "pyproject.toml"
+    assert commands == {
+        line.split()[0] for line in scripts.read_text().splitlines() if "cli.main:" in line
+    }
+
+
+def test_modules_run_as_commands(tmp_path: Path) -> None:
+    done = run_python(tmp_path, "-m", "tangent_train.cli.export", "output=x.onnx")
+    assert done.returncode == 1
+    example = "tangent-export checkpoint=<run>/checkpoints/best.ckpt output=model.onnx"
+    assert done.stderr == f"tangent-export: Missing: checkpoint=. Example: {example}\n"
 
 
 @pytest.mark.parametrize(
