@@ -61,7 +61,7 @@ def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
         ),
         ("transfer experiment=rooms/transfer label_map=no.json", "label_map: found no.json; "),
         ("predict input=. output=a checkpoint=. rotations=361", "less than or equal to 360."),
-        ("render", "and output=. Example: tangent-render input=panoramas output=tangent"),
+        ("render", "Missing: output=. Example: tangent-render input=panoramas output=tangent"),
         ("train data=5", "data: found 5; expected one of cityscapes, densepass, "),
         (
             "train debug=true",
