@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -10,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from torch import Tensor
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
 
 pytest.importorskip("e3nn")
@@ -161,9 +158,3 @@ def test_the_number_of_parameters_is_that_of_the_released_code() -> None:
     network = SphericalCNN(6, 55, 4, [100, 100], [16, 10])
     rings = 6 * 100 * 32 + 100 * 100 * 32
     assert sum(p.numel() for p in network.parameters()) == rings + 2 * 200 + 101 * 55
-
-
-def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "e3nn", None)
-    with pytest.raises(SettingError, match=r"network=spherical_cnn: .*'\.\[spectral\]'"):
-        SphericalCNN(6, 10, 2)
