@@ -8,11 +8,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from torch import Tensor
 
-from tangent_train.geometry import equirect_directions
-
-pytest.importorskip("e3nn")
-
 from models.spherical_cnn import RingCorrelation, SphericalCNN
+from tangent_train.geometry import equirect_directions
 
 Points = NDArray[np.float64]
 
