@@ -232,7 +232,6 @@ def _angles_deg(trained: LoadedNetwork) -> list[int]:
 @pytest.mark.parametrize(
     ("size", "levels", "side", "angles_deg"),
     [
-        ((384, 384), [9, 8], 384, [79, 118]),
         ((512, 1024), [10, 9], 1024, [96, 131]),
         ((480, 640), [9, 8], 640, [108, 140]),
     ],

@@ -211,7 +211,6 @@ _PART_AREA = [-90, 90, -90, 45]
 @pytest.mark.parametrize(
     ("boxes", "axis", "shown", "area"),
     [
-        (b"", 0, _WHOLE, None),
         (b"", 1, _PART, _PART_AREA),
         (stereo_box(2) + _TILE, 1, _PART, None),
     ],
