@@ -117,6 +117,17 @@ def test_probabilities_of_a_class_add_up(unmapped: Unmapped, nothing: list[int] 
     np.testing.assert_array_equal(labels, wanted)
 
 
+def test_a_class_without_scores_wins_in_no_mean_of_pixels() -> None:
+    """Scores of pixels and images are averaged with weights that may be 0."""
+    trained = map_classes(
+        _trained(["a", "b"]), LabelMap.of({"none": [], "b": ["b"]}), "never"
+    ).loaded
+    found = trained.network(1e4 * torch.randn(64, 2, 1, 1))[..., 0, 0]
+    weights = torch.rand(256, 64) * (torch.rand(256, 64) < 0.5)
+    assert bool((weights @ found).argmax(1).bool().all())
+    assert bool(found.isfinite().all())
+
+
 def test_the_order_and_the_number_of_classes_can_be_those_of_data() -> None:
     given = LabelMap.of({"floor": ["floor"], "wall": ["wall"]})
     trained = map_classes(_trained(["wall", "floor"]), given, targets=("wall", "sofa", "floor"))

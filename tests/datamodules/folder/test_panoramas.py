@@ -156,3 +156,21 @@ def test_names_that_look_the_same_are_the_same(
     assert module.check()[0].listed() == []
     assert module.dataset("test").name(0) == NFC
     assert module.dataset("test").read(0).labels.any()
+
+
+def test_labels_of_other_classes_are_warned_of_in_training(
+    tmp_path: Path, erp: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_classes(tmp_path, {"wall": 1, "door": 2})
+    for number in range(3):
+        write_panorama(tmp_path, f"{number}", number, 16)
+        labels = np.where(np.arange(32) < 12, 1, 9) * np.ones((16, 1))
+        save(tmp_path / "labels" / f"{number}.png", labels.astype(np.uint8))
+    module = FolderPanoramas(tmp_path, erp)
+    module.class_weights("none")
+    assert capsys.readouterr().out == ""
+    assert module.class_weights("log")[1] == 0
+    assert capsys.readouterr().out == (
+        "Warning: 62.5 % of the pixels for train are unknown.\n"
+        "Warning: Classes without a pixel for train: door (1 of 2).\n"
+    )
