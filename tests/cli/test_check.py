@@ -95,17 +95,15 @@ def test_distances_are_counted_and_stored(tmp_path: Path, capsys: Capture) -> No
     assert np.unique(stored["labels"]).tolist() == [0, 3 * 512]
 
 
-def test_the_views_of_an_area_are_counted(tmp_path: Path, capsys: Capture) -> None:
+def test_images_of_another_shape_than_the_area_are_named(tmp_path: Path, capsys: Capture) -> None:
     write_classes(tmp_path, [None, "door"])
     for name in ("a", "b", "c"):
         save(tmp_path / "images" / f"{name}.png", np.zeros((12, 64, 3), np.uint8))
         save(tmp_path / "labels" / f"{name}.png", np.ones((12, 64), np.uint8))
     (tmp_path / "test.txt").write_text("a")
     area = "[-180,180,-33.75,33.75]"
-    expected = f"Area {area.replace(',', ', ')}: 55.6 % of the sphere; 10 of 20 views, 16 × 16"
-    _, err = _checked(tmp_path, capsys, f"data.area={area}")
-    assert expected in err
+    _checked(tmp_path, capsys, f"data.area={area}")
     with pytest.raises(SystemExit):
         _checked(tmp_path, capsys, "data.area=[-180,180,-60,60]")
-    out, err = capsys.readouterr()
+    out = capsys.readouterr().out
     assert out.count("expected 64 × 21.3 (width × height): square pixels in area=") == 3

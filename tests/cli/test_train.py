@@ -52,15 +52,11 @@ def _last(folder: Path) -> Any:
     return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
 
 
-def test_a_refused_run_names_the_setting_and_leaves_no_folder(run: Run, rooms: str) -> None:
+def test_a_refused_run_names_the_setting(run: Run, rooms: str) -> None:
     """The largest rate of the schedule is that of the optimizer."""
     wrong = ("optimizer.lr=abc", "scheduler=one_cycle")
     with pytest.raises(SystemExit, match=r"optimizer\.lr: found abc"):
         run("train", *SETTINGS, rooms, *wrong)
-    assert [path for path in Path("runs").rglob("*") if path.is_file()] == []
-    with pytest.raises(SystemExit, match="levl"):
-        run("train", "data=synthrooms", "+levl=5", "hydra.run.dir=mine")
-    assert Path("mine", ".hydra").is_dir(), "the folder that was typed"
 
 
 def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
@@ -171,10 +167,7 @@ def test_an_incomplete_test_leaves_no_results(
         (["representation.faces_per_panorama=99"], "representation.faces_per_panorama: found 99"),
         (["task=classification"], "task: found a task for image_class"),
         (["+data.rooot=x"], "Did you mean data.root?"),
-        (
-            ["+callbacks.x={_target_: lightning.pytorch.callbacks.LearningRateFinder}"],
-            r"callbacks\.x: found LearningRateFinder; .*-m optimizer\.lr=",
-        ),
+        (["network._target_=models.Absent"], "Absent"),
         (["task.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
     ],
 )

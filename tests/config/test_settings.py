@@ -185,6 +185,9 @@ def test_settings_of_one_name_are_explained_apart() -> None:
         ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "resume=nowhere", "nowhere: found no config.yaml"),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
+        ("train", "", "Missing: data= or experiment="),
+        ("evaluate", "data=synthrooms", "checkpoint: found null; expected a network, or"),
+        ("check", "data=synthrooms values=ids", "values: found ids; expected null: nothing reads"),
     ],
 )
 def test_answers_before_anything_heavy_is_imported(
