@@ -35,7 +35,7 @@ def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
         ("train data.root=r(a", "data.root=r(a: found text that Hydra cannot read; "),
         ("train experiment=rooms/demoo", "Could not find 'experiment/rooms/demoo' Available "),
         ("predict input=. output=a checkpoint=. rotations=361", "less than or equal to 360."),
-        ("render", "and output=. Example: tangent-render input=panoramas output=tangent"),
+        ("render", "Missing: output=. Example: tangent-render input=panoramas output=tangent"),
         ("train data=5", "Config group override"),
         ("predict representation=erp", "Could not override 'representation'. No match in the "),
         ("evaluate recipe=small", UNREAD),
