@@ -165,13 +165,11 @@ class _Prediction:
         on_device = settings.device, settings.view_batch_size, settings.compile
         self._predictor = Predictor(loaded, head, views, *on_device)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
-        self._depth = None
-        if "depth" in loaded.inputs:
-            if settings.depth is None:
-                expected = "a folder of depth images, which the network takes"
-                raise SettingError("depth", found="null", expected=expected)
-            of_file = settings.depth_scale, settings.depth_channel
-            self._depth = images.DepthFolder(settings.depth, *of_file)
+        if "depth" in loaded.inputs and settings.depth is None:
+            expected = "a folder of depth images, which the network takes"
+            raise SettingError("depth", found="null", expected=expected)
+        of_file = settings.depth_scale, settings.depth_channel
+        self._depth = images.DepthFolder(settings.depth, *of_file) if settings.depth else None
 
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""
@@ -263,9 +261,8 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()
-    return names | (
-        {"depth", "depth_scale", "depth_channel"} if "depth" in loaded.inputs else set()
-    )
+    takes_depth = "depth" in loaded.inputs or loaded.things
+    return names | ({"depth", "depth_scale", "depth_channel"} if takes_depth else set())
 
 
 if __name__ == "__main__":

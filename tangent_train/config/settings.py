@@ -120,7 +120,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     fov: FieldOfView | None = None
     """photos: horizontal field of view in degrees; null = from EXIF"""
     depth: ExistingPath | None = None
-    """folder of depth images named as the inputs, for networks that need depth"""
+    """folder of depth images named as the inputs, e.g. depth/ of another prediction: for networks
+    that need depth, and for the distances of objects"""
     depth_scale: PositiveFloat = 1000
     """units per meter in depth files of whole numbers, read and written"""
     depth_channel: str | None = None
