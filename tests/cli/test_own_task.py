@@ -67,6 +67,7 @@ def test_a_head_of_ones_own_trains_evaluates_reports_and_resumes(
     with Path("report/report.csv").open(newline="") as file:
         lines = [(row["fold"], row["score"], float(row["mean"])) for row in csv.DictReader(file)]
     assert lines == [(fold, "mae", results["scores"]["mae"]) for fold in ("1", "mean")]
+    assert Path("report/report.png").stat().st_size > 5000
 
     run("train", f"resume={folder}", "trainer.max_epochs=4", TRUST)
     assert torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["epoch"] == 3

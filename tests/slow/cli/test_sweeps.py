@@ -67,6 +67,7 @@ def test_optuna_compares_runs_of_submitit_by_their_validation(
     settings: tuple[str, ...],
     tmp_path: Path,
     run: Run,
+    capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def late(*arguments: Any, move: Callable[..., None] = JobPaths.move_temporary_file) -> None:
@@ -81,6 +82,8 @@ def test_optuna_compares_runs_of_submitit_by_their_validation(
     (first,), (second,) = map(_writers, runs)
     assert len({os.getpid(), first, second}) == 3
     found = [json.loads((run / "validation.json").read_text()) for run in runs]
+    score = results(runs[1])["scores"]["miou"]
+    assert f"study/1: miou {score:.4g}, val/miou {found[1]['best']:.4g}\n" in capfd.readouterr().out
     assert [figure["figure"] for figure in found] == ["val/miou", "val/miou"]
     best = (tmp_path / "study" / "optimization_results.yaml").read_text()
     (value,) = re.findall(r"best_value: (\S+)", best)
