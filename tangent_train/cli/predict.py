@@ -25,6 +25,7 @@ from tangent_train.heads.pictures import evenly_spread
 from tangent_train.inference import images
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.engine import Predictor, UpLikelihood
+from tangent_train.inference.mask_network import MaskNetwork, is_network
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.manifest import Manifest, Shard
@@ -62,7 +63,7 @@ def predict(settings: PredictSettings) -> None:
         finished = [name for name in names if name not in left]
         if second := prediction.one_scale:
             second.fit({name: manifest.finished[name][folder.head.summary] for name in finished})
-            errors |= _work("Scaling", inputs, finished, manifest, second.scaled, prediction)
+            errors |= _work("Scaling", inputs, finished, manifest, prediction.scaled, prediction)
         errors |= _write_videos(inputs, folder, manifest)
         entries = [{"name": n, **manifest.finished.get(n, errors.get(n, {}))} for n in names]
         folder.write_summary(content, entries)
@@ -157,17 +158,18 @@ class _Prediction:
         if settings.upright == "auto":
             loaded.check_predicts(PIXEL_CLASSES, "Use upright=pose, or null.")
         self._settings, self._head = settings, head
-        self._masks = mask_reader(settings.mask, settings.mask_classes)
+        networks = [mask for mask in settings.mask or () if is_network(mask)]
+        files = [mask for mask in settings.mask or () if mask not in networks]
+        self._masks = mask_reader(files, settings.mask_classes)
+        self._mask_networks = [MaskNetwork(file, settings) for file in networks]
         on_device = settings.device, settings.view_batch_size, settings.compile
         self._predictor = Predictor(loaded, head, views, *on_device)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
-        self._depth = None
-        if "depth" in loaded.inputs:
-            if settings.depth is None:
-                expected = "a folder of depth images, which the network takes"
-                raise SettingError("depth", found="null", expected=expected)
-            of_file = settings.depth_scale, settings.depth_channel
-            self._depth = images.DepthFolder(settings.depth, *of_file)
+        if "depth" in loaded.inputs and settings.depth is None:
+            expected = "a folder of depth images, which the network takes"
+            raise SettingError("depth", found="null", expected=expected)
+        of_file = settings.depth_scale, settings.depth_channel
+        self._depth = images.DepthFolder(settings.depth, *of_file) if settings.depth else None
 
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""
@@ -196,16 +198,25 @@ class _Prediction:
         def result() -> tuple[Any, Any]:
             return mosaic.pixels(), mosaic.facts
 
-        return image, result if self._head.waits else result()
+        return image, result if self._head.waits else result(), self._unmasked(image)
+
+    def scaled(self, job: Job, progress: Callable[[float], object]) -> tuple[Any, ...]:
+        """Return an image at its scale, as `predict` does."""
+        one_scale: Any = self.one_scale
+        return *one_scale.scaled(job, progress), self._unmasked(job.value)
+
+    def _unmasked(self, image: images.InputImage) -> Any:
+        """Return True where the networks of `mask` leave the pixels of an image."""
+        return np.logical_and.reduce([network(image) for network in self._mask_networks])
 
     def write(self, job: Job) -> dict[str, Any]:
         """Write the results of one image; return its entry in the summary."""
-        image, result = job.value
+        image, result, unmasked = job.value
         predicted = PredictedImage.fetch(image, *(result() if callable(result) else result))
         _, pixels, facts = predicted
         is_counted = np.array(True)
         if image.area is not None:
-            is_counted = image.cut(self._masks(job.name, image.area)) > 0
+            is_counted = image.cut((self._masks(job.name, image.area) > 0) & unmasked)
             unknown = pixels.dtype.type(self._head.unknown)
             predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
         if self.one_scale and not self.one_scale.facts:
@@ -250,9 +261,8 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()
-    return names | (
-        {"depth", "depth_scale", "depth_channel"} if "depth" in loaded.inputs else set()
-    )
+    takes_depth = "depth" in loaded.inputs or loaded.things
+    return names | ({"depth", "depth_scale", "depth_channel"} if takes_depth else set())
 
 
 if __name__ == "__main__":

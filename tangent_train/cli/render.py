@@ -74,6 +74,8 @@ def render(settings: RenderSettings) -> None:
         remedy = "Example: tangent-render input=panoramas output=tangent"
         raise SettingError("input, back and poses", found=found, expected=expected, remedy=remedy)
     run, read = _MODES[modes[0]]
+    read = read | (_OF_PROJECTS if settings.colmap or settings.nerfstudio else set())
+    read |= _OF_NERFSTUDIO if settings.nerfstudio else set()
     check_read(settings, {*read, *modes, "output", "overwrite"})
     run(settings, settings.model_dump(mode="json", exclude={*settings.not_content}))
 
@@ -297,13 +299,16 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
         _render_views,
         {"every", "area", "eye", "views", "base_level", "level", "dim", "faces", "rotation"}
         | {*_DIRECTIONS, "format"}
-        | {"interpolation", "colmap", "mask", "mask_classes", "depth_channel"}
-        | {"nerfstudio", "poses", "cameras", "depth", "depth_scale"},
+        | {"interpolation", "colmap", "nerfstudio", "depth_channel"},
     ),
     "back": (_render_back, {"cameras", "blend", "height", "kind", "depth_channel", "z_depth"}),
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
+
+_OF_PROJECTS = {"mask", "mask_classes"}
+_OF_NERFSTUDIO = {"poses", "cameras", "depth", "depth_scale"}
+"""Settings that are read with colmap=true or nerfstudio=true, and with the latter only."""
 
 _SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
 

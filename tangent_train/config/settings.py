@@ -120,7 +120,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     fov: FieldOfView | None = None
     """photos: horizontal field of view in degrees; null = from EXIF"""
     depth: ExistingPath | None = None
-    """folder of depth images named as the inputs, for networks that need depth"""
+    """folder of depth images named as the inputs, e.g. depth/ of another prediction: for networks
+    that need depth, and for the distances of objects"""
     depth_scale: PositiveFloat = 1000
     """units per meter in depth files of whole numbers, read and written"""
     depth_channel: str | None = None
@@ -169,8 +170,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """panoramas: pixels that become unknown (0): below a latitude (-60), black in a PNG file, or in
     a folder of one file per panorama; also several, e.g. [-60,tripod.png]; null = none"""
     mask_classes: OneOrMore[str] | None = None
-    """classes that become unknown, e.g. [sky], with mask= a folder that tangent-predict wrote
-    (labels/, classes.json); null = none"""
+    """classes that become unknown, e.g. [sky], with mask= the file of a network that predicts them,
+    or a folder that tangent-predict wrote (labels/, classes.json); null = none"""
     min_confidence: Share = 0
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
     depth_format: Literal["png", "npy", "exr"] | None = None
@@ -507,6 +508,14 @@ class FilesSettings(RunSettings):
     depth_channel: str | None = None
     """predictions: channel of OpenEXR files; null = as tangent-predict"""
 
+    @model_validator(mode="after")
+    def _check_predictions(self) -> Self:
+        """Refuse settings that are read with predictions only."""
+        if self.predictions is None:
+            of_files = {"values", "files", "resample", "depth_scale", "depth_channel"}
+            check_read(self, type(self).model_fields.keys() - of_files)
+        return self
+
 
 class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
     """Settings of tangent-evaluate."""
@@ -539,13 +548,13 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
     level: Level | None = None  # type: ignore[assignment]
     """level s, the angular resolution; null = as in the checkpoint"""
 
-
-class PrepareSettings(RunSettings):
-    """Settings of tangent-prepare."""
-
-    # --- performance ---
-    shard: str | int | None = None
-    """part of the cache for this process, e.g. 3/16; null = all"""
+    @model_validator(mode="after")
+    def _check_network(self) -> Self:
+        """Refuse an evaluation of nothing."""
+        if self.checkpoint is None and self.predictions is None:
+            expected = "a network, or predictions=<folder>"
+            raise SettingError("checkpoint", found="null", expected=expected)
+        return self
 
 
 class PhotoSettings(Settings):
@@ -627,7 +636,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "render": RenderSettings,
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
-    "prepare": PrepareSettings,
+    "prepare": RunSettings,
     "check": FilesSettings,
 }
 """Settings by the name of the command."""
