@@ -14,6 +14,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from datamodules.core.label_map import PANOPTIC
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
+from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
 from tangent_train.cli.scored_files import score_files
 from tangent_train.config.build import build_from_config
@@ -125,8 +126,10 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
         section = {**section, "level": level}
     data = settings.data if settings.input is None else {"_target_": "panoramas"}
     if loaded.inputs:
-        mean, std = list(loaded.normalization.mean), list(loaded.normalization.std)
-        normalization = {"mean": mean, "std": std}
-        data = {**data, "inputs": list(loaded.inputs), "normalization": normalization}
+        data = {**data, **loaded.data_settings}
     network = loaded.settings
     return {"level": level, "representation": section, "data": data, "network": network}
+
+
+if __name__ == "__main__":
+    main.evaluate()

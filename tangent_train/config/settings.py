@@ -102,6 +102,9 @@ class ImageSettings(Settings):
     area: tuple[float, float, float, float] | None = None
     """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
     sphere"""
+    eye: Literal["left", "right"] | None = None
+    """stereo panoramas (two pictures above or beside each other): left | right; null = not
+    stereo"""
 
 
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):

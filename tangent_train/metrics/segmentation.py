@@ -159,7 +159,7 @@ def _count_panorama(prediction: Tensor, truth: Tensor, k: int) -> tuple[Tensor, 
 
 
 def confusion(prediction: Tensor, truth: Tensor, k: int) -> Tensor:
-    """Count the pixels of known classes, ``(K + 1, K + 1)``."""
+    """Count the pixels of known classes."""
     pairs = torch.add(prediction.int(), truth.int(), alpha=k).flatten()
     counts = torch.bincount(pairs, minlength=k * k).reshape(k, k)
     counts[UNKNOWN] = 0
