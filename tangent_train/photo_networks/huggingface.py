@@ -376,8 +376,7 @@ def _load_tensors(network: Any, tensors: dict[str, Tensor], folder: Path) -> Non
         raise DataError(
             folder,
             found=f"other weights: {', '.join(wrong[:_LISTED])}",
-            expected=f"weights of {type(inner).__name__} as described in config.json"
-            + ", for the classes in its id2label" * hasattr(network, "is_universal"),
+            expected=f"weights of {type(inner).__name__} as described in config.json",
         )
     inner.load_state_dict(loaded.state_dict())
 
