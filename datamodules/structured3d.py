@@ -45,7 +45,6 @@ from datamodules.core.label_map import PANOPTIC, LabelMap
 from datamodules.stanford2d3ds.files import EIGHT
 from tangent_train.io.image_files import glob_files
 from tangent_train.io.pixel_files import read_image_size, read_pixels
-from tangent_train.metrics.panoptic import LABEL
 
 CLASSES: tuple[str, ...] = (
     *("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf"),
@@ -64,7 +63,6 @@ THINGS = tuple(
 INVALID = ("01155", "01192", "01714", "01816", "01852", "03398")
 """Scenes that the errata of the release call invalid; published lists of images hold them."""
 
-_BACKGROUND = 65535
 _PUBLISHED = {"train": 18362, "val": 1776, "test": 1697}
 _FIRST = (0, 3000, 3250)
 """First scene of each split."""
@@ -162,14 +160,12 @@ class Structured3D(Structured3DImages, PanoramaDataModule):
     place = "panorama/{}"
 
     def decode_labels(self, files: ImageFiles) -> Labels:
-        """See `ImageDataModule`; furniture without a number is unknown."""
+        """See `ImageDataModule`."""
         labels, path = super().decode_labels(files), cast("Path", files.labels)
         if self.labels != PANOPTIC:
             return labels
         numbers = read_pixels(path.with_name("instance.png"), indices=True)
-        is_thing = np.isin(self.class_names, self.things)[labels]
-        codes = labels * np.int32(LABEL) + (numbers + np.int32(1)) * is_thing
-        return np.where(is_thing & (numbers == _BACKGROUND), 0, codes)
+        return self.panoptic_map(labels, numbers + np.uint16(1))  # 0 is background
 
 
 @data_set

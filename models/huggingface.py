@@ -225,7 +225,7 @@ class HuggingFaceNetwork(_TransformersNetwork):
         return {"out": scores, "segments": segments} if self._stuff is not None else scores
 
     def _segments(self, returned: Any, size: tuple[int, int]) -> list[Segments]:
-        """Return the library's panoptic segmentation of each image."""
+        """Return the things of the library's panoptic segmentation of each image."""
         made = self.network.config
         named: dict[str, Any] = {"label_ids_to_fuse": self._stuff}
         if made.model_type.startswith("eomt"):
@@ -233,14 +233,14 @@ class HuggingFaceNetwork(_TransformersNetwork):
             named, returned["patch_offsets"] = {"stuff_classes": self._stuff, "size": sides}, None
         process = image_processor_class(made)().post_process_panoptic_segmentation
         found = process(returned, target_sizes=[size] * len(returned[0]), **named)
-        return [_segments_of(each["segmentation"], each["segments_info"]) for each in found]
+        return [self._objects(each["segmentation"], each["segments_info"]) for each in found]
 
-
-def _segments_of(numbers: Tensor, infos: Sequence[Mapping[str, Any]]) -> Segments:
-    """Return the library's segments of one image as objects."""
-    given = [torch.tensor([info[key] for info in infos]) for key in ("id", "label_id", "score")]
-    ids, classes, scores = (values.to(numbers.device) for values in given)
-    return front_segments(numbers == ids[:, None, None], classes.long(), scores)
+    def _objects(self, numbers: Tensor, infos: Sequence[Mapping[str, Any]]) -> Segments:
+        """Return the library's segments of one image, without stuff."""
+        infos = [info for info in infos if info["label_id"] not in (self._stuff or ())]
+        given = [torch.tensor([info[key] for info in infos]) for key in ("id", "label_id", "score")]
+        ids, classes, scores = (values.to(numbers.device) for values in given)
+        return front_segments(numbers == ids[:, None, None], classes.long(), scores)
 
 
 _BILINEAR = ("depth_pro", "tipsv2_dpt")

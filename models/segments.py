@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class Segments(NamedTuple):
-    """Objects of one image. They do not overlap.
+    """Objects of one image, without stuff. They do not overlap.
 
     Attributes:
         numbers: ``(h, w)`` int32 number of the object at each pixel, from 1; 0 for none.

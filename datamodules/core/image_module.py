@@ -176,6 +176,12 @@ class ImageDataModule(DataModule):
         labels: NDArray[np.uint8] = label_map.read_labels(files.labels)
         return labels
 
+    def panoptic_map(self, labels: Labels, numbers: Labels) -> Labels:
+        """Return labels with the numbers of objects; things without a number are unknown."""
+        is_thing = np.isin(self.class_names, self.things)[labels]
+        codes = labels * np.int32(LABEL) + numbers * is_thing
+        return np.where(is_thing & (numbers == 0), 0, codes)
+
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Return depth in steps of 1/512 m, 0 where missing; see `read_depth_m`."""
         path: Any = files.depth

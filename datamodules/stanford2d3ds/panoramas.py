@@ -51,7 +51,6 @@ from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.image_files import glob_files
 from tangent_train.io.pixel_files import read_rgb
-from tangent_train.metrics.panoptic import LABEL
 
 GET_IT = "Get Stanford2D3DS from http://buildingparser.stanford.edu, or choose data=synthrooms."
 """Remedy if the data set is missing."""
@@ -60,7 +59,6 @@ _NAME = re.compile(
     r"camera_([0-9a-f]{32})_([A-Za-z]+_\d+)_frame_(equirectangular|\d+)_domain_rgb\.png"
 )
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-_BYTE = 256
 _THIRTEEN = LabelMap.of(stanford.CLASSES)
 
 
@@ -207,9 +205,7 @@ class StanfordImages(ImageDataModule):
         labels = table.decode(colors, path)
         if self.labels != PANOPTIC:
             return labels
-        numbers = colors[..., 1:] @ np.array([_BYTE, 1], np.int32)
-        is_thing = np.isin(self.class_names, self.things)[labels]
-        return labels * np.int32(LABEL) + numbers * is_thing
+        return self.panoptic_map(labels, colors[..., 1:] @ np.array([256, 1], np.int32))
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
         """See `ImageDataModule`: by the pose file, if there is one."""

@@ -174,8 +174,7 @@ class _Prediction:
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""
         settings, image = self._settings, job.value or job.path
-        stem = job.name.removesuffix(job.path.suffix)
-        depth = None if self._depth is None else partial(self._depth.read, stem)
+        depth = None if self._depth is None else partial(self._depth.read, job.name)
         if settings.projection == "perspective":
             return images.read_photo(image, settings.fov, depth)
         return images.read_panorama(image, settings.area, settings.upright, depth, settings.eye)

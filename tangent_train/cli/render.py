@@ -117,7 +117,7 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
             write_views(image, images, kind, progress)
             write_views(masks(job.name, area), of_images, "nearest", lambda _: None)
             if distances is not None:
-                path = find_depth(distances, job.name.removesuffix(job.path.suffix), "")
+                path = find_depth(distances, job.name, "")
                 depth = read_depth_m(path, settings.depth_scale, settings.depth_channel)
                 write_z_depth(area.place(resize(depth, area.image_shape, "nearest")), depths)
             return

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tangent_train.errors import wrong_setting
+from tangent_train.errors import SettingError, wrong_setting
 from tangent_train.heads.base import Head, PredictedImage, Scores
 from tangent_train.heads.classes import ClassesHead, ImageClassHead
 from tangent_train.heads.distance import DistanceHead
@@ -32,8 +32,11 @@ def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:
         **settings: Settings of the head, see `Head.predict_settings`.
 
     Raises:
-        SettingError: A setting is not one of that head, or invalid.
+        SettingError: A setting is not one of that head, or invalid; or there are too many classes.
     """
+    if (count := len(loaded.class_names) - 1) > 255:  # labels in files have 8 bits
+        remedy = "Map them to fewer with label_map=."
+        raise SettingError("classes", found=count, expected="at most 255", remedy=remedy)
     try:
         if loaded.depth_kind is not None:
             return DistanceHead(depth_kind=loaded.depth_kind, **settings)

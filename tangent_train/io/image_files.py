@@ -226,8 +226,8 @@ def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:
 
     Args:
         files: The depth maps.
-        name: Path of the image below the folder of images, without suffix. The depth map has the
-            same name, or that with ``_depth`` at the end, and one of `DEPTH_SUFFIXES`.
+        name: Name of the image, see `short_names`. The depth map has the same name, or that with
+            ``_depth`` at the end, and one of `DEPTH_SUFFIXES`.
         remedy: Remedy for a missing file.
 
     Raises:

@@ -105,7 +105,7 @@ def encode_image(
         truth: True labels or distances ``(h, w)``; 0 and NaN are unknown.
         confidence: Confidence ``(h, w)`` of predicted labels, from 0 to 1.
         numbers: Numbers ``(h, w)`` of predicted objects, 0 for none; None without objects.
-        objects: Row of each object in the table by its number; those above 255 are not shown.
+        objects: Row of each object in the table by its number.
         is_metric: True for distances in meters; False for distances up to a scale.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers, for points.
         sphere: True for a panorama.
@@ -124,9 +124,9 @@ def encode_image(
         seen = [(k, *of) for k, of in enumerate(shares.T.tolist()) if any(of)]
         more["shares"] = sorted(seen, key=lambda entry: -max(entry[1:]))
         if numbers is not None:
-            shown = np.where(numbers < 256, numbers, 0).astype(np.uint8)
-            green, red = _shrunk(shown, side, cv2.INTER_NEAREST_EXACT), maps["prediction"]
-            maps["prediction"] = np.stack([0 * red, green, red], axis=-1)
+            shown = _shrunk(numbers.astype(np.uint16), side, cv2.INTER_NEAREST_EXACT)
+            blue_first = [shown >> 8, shown & 255, maps["prediction"]]
+            maps["prediction"] = np.stack(blue_first, axis=-1).astype(np.uint8)
             more["objects"] = objects
     elif maps:
         camera = None

@@ -203,6 +203,25 @@ def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predi
         predict(depth=depth, output="none")
 
 
+def test_depth_of_images_that_differ_only_in_their_suffix(tmp_path: Path, predict: Predict) -> None:
+    """It is named as their results: 1.bmp.npy and 1.png.npy."""
+    checkpoint = write_checkpoint(tmp_path / "d.ckpt", channels=4)
+    for name, meters in (("1.bmp", 0.5), ("1.png", 3.5), ("2.png", 0.5), ("3.png", 3.5)):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        Image.fromarray(sphere(32)).save(tmp_path / "in" / name)
+        (tmp_path / "depth").mkdir(exist_ok=True)
+        file = name.removesuffix("" if name[0] == "1" else ".png") + ".npy"
+        np.save(tmp_path / "depth" / file, np.full((32, 64), meters, np.float32))
+    predict(checkpoint=checkpoint, depth="depth")
+    names = ("1.bmp", "1.png", "2", "3")
+    near, far, *alone = (read_png(tmp_path / "out" / "labels" / f"{name}.png") for name in names)
+    assert (near != far).any()
+    np.testing.assert_array_equal([near, far], alone)
+    (tmp_path / "depth" / "1.bmp.npy").rename(tmp_path / "depth" / "1.npy")
+    with pytest.raises(SystemExit, match="1 of 4 images"):
+        predict(checkpoint=checkpoint, depth="depth", output="again")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

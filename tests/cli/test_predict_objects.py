@@ -144,6 +144,41 @@ def test_python_returns_labels_and_objects(network: Path) -> None:
     assert {each["class"] for each in objects} == {"chair", "table"}
 
 
+class Numbered(nn.Module):
+    """An image of red k is of class k, and one object."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.scores = nn.Parameter(30 * torch.eye(count))
+
+    def forward(self, images: Tensor) -> Any:
+        classes = (255 * images[:, 0]).round().long().clamp(max=len(self.scores) - 1)
+        whole = torch.ones(images.shape[-2:]).int()
+        segments = [Segments(whole, of[:1, 0], torch.ones(1)) for of in classes]
+        return {"out": self.scores[classes].movedim(-1, 1), "segments": segments}
+
+
+@pytest.mark.parametrize("count", [255, 256])
+def test_labels_of_panoptic_maps_have_8_bits(tmp_path: Path, predict: Predict, count: int) -> None:
+    names, trust = [f"class {k}" for k in range(count)], f"{__name__}.Numbered"
+    settings = {"_target_": trust, "count": count}
+    photo = PhotoNetwork(Numbered(count), settings, names, UNIT, (64, 64), things=names)
+    import_network(photo, tmp_path / "net.ckpt")
+    rgb = np.zeros((32, 64, 3), np.uint8)
+    rgb[..., 0] = 254
+    write_pixels(tmp_path / "in" / "hall.png", rgb)
+    given = {"checkpoint": "net.ckpt", "write": "[panoptic]", "trust": f"[{trust}]"}
+    label, message = 255, r"classes: found 256; expected at most 255.*label_map"
+    if count > 255:
+        with pytest.raises(SystemExit, match=message):
+            predict(**given)
+        (tmp_path / "map.json").write_text(json.dumps({"none": [], "last": names[254:]}))
+        given["label_map"], label = "map.json", 2
+    predict(**given)
+    colors = read_pixels(tmp_path / "out" / "panoptic" / "hall.png", indices=False)
+    np.testing.assert_array_equal(colors, np.broadcast_to([1, 0, label], colors.shape))
+
+
 def test_networks_without_objects_are_refused(tmp_path: Path) -> None:
     photo = PhotoNetwork(Connected(), SETTINGS, NAMES, UNIT, (64, 64))
     import_network(photo, tmp_path / "net.ckpt")

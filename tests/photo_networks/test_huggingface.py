@@ -13,7 +13,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from datamodules.core.label_map import LabelMap
 from tangent_train.errors import DataError, SettingError
+from tangent_train.inference.api import map_classes
 from tangent_train.photo_networks import huggingface
 from tests.photo_networks import huggingface_networks as networks
 
@@ -98,6 +100,23 @@ def test_objects_are_those_of_the_library(
         assert 0 < float(mask.float().mean()) < 1
         assert torch.equal(found.numbers == number, mask)
         assert round(float(found.scores[number - 1]), 6) == info["score"]
+
+
+@torch.no_grad()
+def test_stuff_is_not_an_object_of_a_class_of_things(tmp_path: Path) -> None:
+    """The library finds one segment of stuff; a label map puts its class among the things."""
+    network, processor = networks.saved(networks.mask2former, tmp_path, noise=1.2)
+    trained = networks.imported(tmp_path, things=networks.NAMES[1:2])
+    images = networks.normalized(trained)
+    (expected,) = processor.post_process_panoptic_segmentation(
+        network(pixel_values=images), target_sizes=[(64, 64)], label_ids_to_fuse={0, 2, 3, 4, 5}
+    )
+    assert [info["label_id"] for info in expected["segments_info"]] == [4]
+    mapped = map_classes(trained, LabelMap.of({"all": networks.NAMES})).loaded
+    assert mapped.things == ("all",)
+    (found,) = mapped.network(images)["segments"]
+    assert not found.numbers.any()
+    assert len(found.classes) == 0
 
 
 def test_oneformer_gets_the_semantic_task(tmp_path: Path) -> None:

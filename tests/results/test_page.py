@@ -110,6 +110,17 @@ def test_a_larger_image_is_shrunk_by_area_and_its_labels_to_the_nearest() -> Non
     assert np.count_nonzero(decoded(image.prediction)) == 50 * 1500
 
 
+def test_all_objects_are_in_the_page() -> None:
+    """The class is red, the number of the object green + 256 blue."""
+    numbers = np.arange(60 * 20).reshape(60, 20)
+    labels = np.full(numbers.shape, 7, np.uint8)
+    rgb = np.zeros((*numbers.shape, 3), np.uint8)
+    image = encode_image("", rgb, CLASSES, prediction=labels, numbers=numbers, objects={})
+    red, green, blue = np.moveaxis(decoded(image.prediction).astype(int), -1, 0)
+    np.testing.assert_array_equal(red, 7)
+    np.testing.assert_array_equal(green + 256 * blue, numbers)
+
+
 def test_shares_are_of_the_solid_angle_on_panoramas_and_of_the_pixels_on_photos() -> None:
     labels = np.ones((90, 180), np.uint8)
     labels[:15] = 2  # the cap above 60°: (1 - sin 60°) / 2 of the sphere, 1/6 of the pixels

@@ -170,11 +170,12 @@ int classAt(sampler2D labels, vec2 uv) {
   return int(round(texelFetch(labels, pixelAt(labels, uv), 0).r * 255.0));
 }
 
-// Class and, in green, object: different numbers on both sides of an outline.
+// Class and, in green and blue, object: different numbers on both sides of an outline.
 int overlaid(vec2 uv) {
-  vec2 bytes = uHasPrediction ? texelFetch(uPrediction, pixelAt(uPrediction, uv), 0).rg :
-      texelFetch(uTruth, pixelAt(uTruth, uv), 0).rg;
-  return int(round(255.0 * bytes.r)) + 256 * int(round(255.0 * bytes.g));
+  vec3 color = uHasPrediction ? texelFetch(uPrediction, pixelAt(uPrediction, uv), 0).rgb :
+      texelFetch(uTruth, pixelAt(uTruth, uv), 0).rgb;
+  ivec3 bytes = ivec3(round(255.0 * color));
+  return bytes.r + 256 * bytes.g + 65536 * bytes.b;
 }
 
 vec3 labels(vec3 photo, vec2 uv, float gray, float opacity) {

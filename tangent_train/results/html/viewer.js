@@ -257,7 +257,7 @@ class Viewer {
     const bytes = this.surface.valueAt(kind, at);
     if (!bytes) return null;
     if (kind === "confidence") return `${kind}: ${Math.round(bytes[0] / 2.55)} %`;
-    const object = kind === "prediction" && this.data.objects?.[bytes[1]];
+    const object = kind === "prediction" && this.data.objects?.[bytes[1] + 256 * bytes[2]];
     if (object) return `${nameOf(kind)}: ${object.class} ${object.number}`;
     if (!this.distances) return `${nameOf(kind)}: ${this.classes[bytes[0]]?.name ?? bytes[0]}`;
     const log = this.distances.log(bytes[0], bytes[1]);
@@ -268,7 +268,8 @@ class Viewer {
   showObject(x, y) {
     const objects = this.data?.objects;
     const at = objects && this.view.locate(x, y);
-    const row = at && objects[this.surface.valueAt("prediction", at)[1]];
+    const bytes = at && this.surface.valueAt("prediction", at);
+    const row = at && objects[bytes[1] + 256 * bytes[2]];
     const cell = (kind, text) => Object.assign(document.createElement(kind), { textContent: text });
     const cells = ([name, value]) => [cell("dt", name), cell("dd", value ?? "unknown")];
     this.find(".object").replaceChildren(...Object.entries(row ?? {}).flatMap(cells));

@@ -297,11 +297,11 @@ def objects_page(folder: Path) -> Path:
     """A panorama with a disc of 20° at longitude 30°, and a photo without objects."""
     directions = equirect_directions((HEIGHT, WIDTH))
     numbers = np.zeros((HEIGHT, WIDTH), np.int32)
-    numbers[directions @ [np.cos(np.pi / 6), np.sin(np.pi / 6), 0] > np.cos(np.pi / 9)] = 7
-    row = {"number": 7, "class": "<b>lamp</b>", "score": 0.81, "longitude_deg": 30.0}
+    numbers[directions @ [np.cos(np.pi / 6), np.sin(np.pi / 6), 0] > np.cos(np.pi / 9)] = 775
+    row = {"number": 775, "class": "<b>lamp</b>", "score": 0.81, "longitude_deg": 30.0}
     rgb, labels = np.full((HEIGHT, WIDTH, 3), 99, np.uint8), np.ones((HEIGHT, WIDTH), np.uint8)
     maps: dict[str, Any] = {"prediction": labels, "numbers": numbers}
-    maps["objects"] = {7: row | {"distance_m": None}}
+    maps["objects"] = {775: row | {"distance_m": None}}
     path = folder / "report.html"
     images = [encode_image("hall", rgb, len(NAMES), **maps), photo()]
     write_report(path, "Objects", images=images, class_names=NAMES)
@@ -314,7 +314,7 @@ def test_a_click_or_tap_shows_the_row_of_the_object(
 ) -> None:
     with opened(browser, objects_page(tmp_path), touch=touch) as report:
         left, top, width, height = report.box()
-        shown = "number 7 class <b>lamp</b> score 0.81 longitude_deg 30 distance_m unknown"
+        shown = "number 775 class <b>lamp</b> score 0.81 longitude_deg 30 distance_m unknown"
 
         def at(longitude_deg: float) -> tuple[float, float]:
             across = math.tan(math.radians(longitude_deg)) / math.tan(math.radians(START_DEG / 2))
@@ -328,7 +328,7 @@ def test_a_click_or_tap_shows_the_row_of_the_object(
 
         assert pointed(-30) == ""
         assert pointed(11) == shown
-        assert "prediction: <b>lamp</b> 7" in report.text(".readout")
+        assert "prediction: <b>lamp</b> 775" in report.text(".readout")
         assert pointed(-30) == ""  # far away: two taps at a place would zoom
         if not touch:
             assert pointed(9) == ""
