@@ -130,7 +130,7 @@ class GlSurface {
     MAPS.forEach((kind, k) => {
       gl.activeTexture(gl.TEXTURE1 + k);
       const map = image[kind] ?? new ImageData(1, 1);
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RG8, gl.RG, gl.UNSIGNED_BYTE, map);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, map);
       this.sizes[kind] = image[kind] && [map.width, map.height];
     });
     for (const bitmap of Object.values(image)) bitmap?.close();
