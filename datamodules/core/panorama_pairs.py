@@ -34,7 +34,6 @@ class PairedPanorama(NamedTuple):
     Attributes:
         name: Unique name; a panorama has the same name in every pair.
         rgb: ``(H, W, 3)`` uint8.
-        file: Image file.
         distance_m: ``(H, W)`` float32 meters from the center, NaN where missing; or None.
         pose: Camera pose; or None.
         valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
@@ -42,7 +41,6 @@ class PairedPanorama(NamedTuple):
 
     name: str
     rgb: NDArray[np.uint8]
-    file: Path
     distance_m: NDArray[np.float32] | None = None
     pose: PanoramaPose | None = None
     valid: NDArray[np.bool_] | None = None
@@ -118,11 +116,6 @@ class PanoramaPairs(ABC):
             raise SettingError("data", found=found, expected=expected)
         return [name for name, _, _ in self.pairs]
 
-    @property
-    def files(self) -> list[Path]:
-        """Image files of all panoramas, without duplicates."""
-        return list(dict.fromkeys(side.rgb for _, *both in self.pairs for side in both))
-
     def read(self, index: int) -> PanoramaPair:
         """Read a pair.
 
@@ -184,4 +177,4 @@ class ImagePairs(PanoramaPairs):
         refuse_stereo(files.rgb, read_tags(files.rgb))
         area = read_area(files.rgb, (rgb.shape[0], rgb.shape[1]))
         whole = area.filled(area.place(rgb), "edge")
-        return PairedPanorama(files.name, whole, files.rgb, valid=area.valid)
+        return PairedPanorama(files.name, whole, valid=area.valid)

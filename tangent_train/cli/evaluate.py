@@ -16,7 +16,7 @@ from datamodules.core.label_map import PANOPTIC
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
-from tangent_train.cli.scored_files import OF_FILES, score_files
+from tangent_train.cli.scored_files import score_files
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import EvaluateSettings, refuse_typed
 from tangent_train.errors import SettingError, check_choice, listed
@@ -40,13 +40,9 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.predictions is not None:
         score_files(settings, folder)
         return
-    refuse_typed(OF_FILES, "nothing: it is read with predictions=")
     if settings.input is not None:
         refuse_typed(("data", "experiment", "panels"), "nothing: input= has no labels")
-    checkpoint = settings.checkpoint
-    if checkpoint is None:
-        expected = "a network, or predictions=<folder>"
-        raise SettingError("checkpoint", found="null", expected=expected)
+    checkpoint: Any = settings.checkpoint
     loaded = load_network(checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])

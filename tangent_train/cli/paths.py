@@ -38,7 +38,7 @@ def check_paths(settings: Settings) -> None:
         raise SettingError("data.root", found=f"{root}, no such folder", expected=expected)
     if isinstance(settings, PredictSettings | RenderSettings) and values["input"] is not None:
         input_paths(values["input"])
-    for path in filter(None, (output, values.get("figure"))):
+    for path in filter(None, (output,)):
         if "overwrite" in values and Path(path).is_file():
             check_new(path, overwrite=values["overwrite"])
     if isinstance(settings, PredictSettings | RenderSettings) and output and not output.is_file():

@@ -22,7 +22,6 @@ from tangent_train.files import check_new
 from tangent_train.geometry import (
     PanoramaPose,
     PinholeGrid,
-    TangentGrid,
     nearest_level,
     perspective_grid,
     to_right_handed,
@@ -44,7 +43,7 @@ from tangent_train.io.gpano import eye_part, read_area, read_tags, shape_of
 from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.io.nerfstudio import write_transforms, write_z_depth
-from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_depth_m, read_image_size, write_pixels
+from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_depth_m, read_image_size
 from tangent_train.io.tangent_folders import (
     TangentResults,
     face_name,
@@ -56,7 +55,6 @@ from tangent_train.io.tangent_folders import (
 from tangent_train.io.videos import read_video_tags
 from tangent_train.keypoints.colmap import is_model, model_points, poses_from
 from tangent_train.manifest import Manifest
-from tangent_train.rendering.figure import tangent_figure
 from tangent_train.rendering.representations.pinhole import ring_size
 from tangent_train.rendering.resampling import resize
 
@@ -70,12 +68,14 @@ def render(settings: RenderSettings) -> None:
     """
     modes = [name for name in _MODES if getattr(settings, name) is not None]
     modes = ["input"] if settings.nerfstudio else modes
-    if len(modes) != 1 or (settings.output or settings.figure) is None:
+    if len(modes) != 1:
         found = " and ".join(modes) or "none of them"
-        expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>, and output="
+        expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>"
         remedy = "Example: tangent-render input=panoramas output=tangent"
         raise SettingError("input, back and poses", found=found, expected=expected, remedy=remedy)
     run, read = _MODES[modes[0]]
+    read = read | (_OF_PROJECTS if settings.colmap or settings.nerfstudio else set())
+    read |= _OF_NERFSTUDIO if settings.nerfstudio else set()
     check_read(settings, {*read, *modes, "output", "overwrite"})
     run(settings, settings.model_dump(mode="json", exclude={*settings.not_content}))
 
@@ -83,10 +83,6 @@ def render(settings: RenderSettings) -> None:
 def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     """Render panoramas to folders of tangent images, or to one project for COLMAP."""
     inputs = Inputs.find(settings.input or "", settings.every, settings.eye, settings.area)
-    if settings.figure is not None:
-        _write_figure(settings, inputs, settings.figure)
-    if settings.output is None:
-        return
     output, kind, suffix = settings.output, settings.interpolation, f".{settings.format}"
     if kind == "nearest" and suffix in LOSSY_SUFFIXES:
         expected = "png, tif or npy with interpolation=nearest: other formats change pixels"
@@ -181,19 +177,6 @@ def _print_written(output: Path, names: Sequence[str], failed: int) -> None:
         sys.exit(f"tangent-render: {text}")
 
 
-def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
-    """Write the figure of the first panorama."""
-    check_new(path, overwrite=settings.overwrite)
-    job = next(iter(inputs.jobs(inputs.names)))
-    kind, channel = settings.interpolation, settings.depth_channel
-    image, _ = read_placed(job.path, kind, settings.area, job.value, channel, settings.eye)
-    grid = _cameras(settings, image.shape[0]).grid
-    if not isinstance(grid, TangentGrid):
-        raise SettingError("figure", found=path, expected="null: only tangent images have a figure")
-    write_pixels(path, tangent_figure(image, grid))
-    print_text(f"Written: {path}")
-
-
 def _cameras(settings: RenderSettings, rows: int) -> CameraFile:
     """Return the images to write of a panorama with some rows; source and shape are not set."""
     grids = _grids(settings, _level(settings, rows))
@@ -260,7 +243,7 @@ def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
 
 def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
     """Write the poses of the panoramas from a model of COLMAP."""
-    model, output = settings.poses or Path(), settings.output or Path()
+    model, output = settings.poses or Path(), settings.output
     check_new(output, overwrite=settings.overwrite)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
     poses = {file: pose for file, (pose, _) in poses_from(model, settings.cameras).items()}
@@ -271,7 +254,7 @@ def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
 
 def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     """Render the results of one panorama to a file, or those of a folder of panoramas."""
-    back, output = settings.back or Path(), settings.output or Path()
+    back, output = settings.back or Path(), settings.output
     root = settings.cameras or back
 
     def write(folder: Path, cameras_file: Path, path: Path, *, adds_suffix: bool = False) -> None:
@@ -317,13 +300,16 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
         _render_views,
         {"every", "area", "eye", "views", "base_level", "level", "dim", "faces", "rotation"}
         | {*_DIRECTIONS, "format"}
-        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"}
-        | {"nerfstudio", "poses", "cameras", "depth", "depth_scale"},
+        | {"interpolation", "colmap", "nerfstudio", "depth_channel"},
     ),
     "back": (_render_back, {"cameras", "blend", "height", "kind", "depth_channel", "z_depth"}),
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
+
+_OF_PROJECTS = {"mask", "mask_classes"}
+_OF_NERFSTUDIO = {"poses", "cameras", "depth", "depth_scale"}
+"""Settings that are read with colmap=true or nerfstudio=true, and with the latter only."""
 
 _SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
 

@@ -26,17 +26,6 @@ _CHECKED = ("lightning.", "torch.optim.", "tangent_train.tasks.")
 optimizers, schedules and tasks. Errors of other classes may be those of the user's own code."""
 
 
-class _ExplainedPartial(partial[Any]):
-    """A function whose errors name its section."""
-
-    place = target = ""
-
-    def __call__(self, *values: Any, **named: Any) -> Any:
-        """Call the function."""
-        with _explained(self.place, self.target):
-            return super().__call__(*values, **named)
-
-
 def build_from_config(section: Any, place: str, **given: Any) -> Any:
     """Build the object that a section of the user's config describes, with Hydra.
 
@@ -58,8 +47,7 @@ def build_from_config(section: Any, place: str, **given: Any) -> Any:
         make = instantiate({"_convert_": "all", **section, "_partial_": True})
         if target.startswith(_CHECKED):
             check_types(make.func, make.keywords, f"{place}.")
-        make = _ExplainedPartial(make.func, *make.args, **make.keywords | given)
-        make.place, make.target = place, target
+        make = partial(make.func, *make.args, **make.keywords | given)
         is_partial = section.get("_partial_") is True
         if is_partial:  # other arguments are refused now, not when it is called
             signature(make.func).bind_partial(*make.args, **make.keywords)

@@ -120,7 +120,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     fov: FieldOfView | None = None
     """photos: horizontal field of view in degrees; null = from EXIF"""
     depth: ExistingPath | None = None
-    """folder of depth images named as the inputs, for networks that need depth"""
+    """folder of depth images named as the inputs, e.g. depth/ of another prediction: for networks
+    that need depth, and for the distances of objects"""
     depth_scale: PositiveFloat = 1000
     """units per meter in depth files of whole numbers, read and written"""
     depth_channel: str | None = None
@@ -170,13 +171,10 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """panoramas: pixels that become unknown (0): below a latitude (-60), black in a PNG file, or in
     a folder of one file per panorama; also several, e.g. [-60,tripod.png]; null = none"""
     mask_classes: OneOrMore[str] | None = None
-    """classes that become unknown, e.g. [sky], with mask= a folder that tangent-predict wrote
-    (labels/, classes.json); null = none"""
+    """classes that become unknown, e.g. [sky], with mask= the file of a network that predicts them,
+    or a folder that tangent-predict wrote (labels/, classes.json); null = none"""
     min_confidence: Share = 0
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
-    min_share: Share = 0
-    """keep at least this share of each class's pixels, the most confident ones, even below
-    min_confidence; measured on up to 32 images"""
     depth_format: Literal["png", "npy", "exr"] | None = None
     """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
     points: PositiveInt | None = None
@@ -199,7 +197,7 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 class RenderSettings(ImageSettings):
     """Settings of tangent-render."""
 
-    not_content = ("figure", "output", "overwrite")
+    not_content = ("output", "overwrite")
 
     # --- input ---
     input: str | Path | None = None
@@ -240,14 +238,12 @@ class RenderSettings(ImageSettings):
     """single views: [width, height] in pixels, or one number; null = by level and fov"""
 
     # --- output ---
-    output: Path | None = None
+    output: Path
     """folder for the tangent images; with back=, the file of the panorama"""
     overwrite: bool = False
-    """true: replace an existing file of figure=, poses=, or back= with one panorama"""
+    """true: replace an existing file of poses=, or back= with one panorama"""
     format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
-    figure: Path | None = None
-    """PNG file of the first panorama and its tangent images; output is then optional"""
 
     # --- COLMAP ---
     colmap: bool = False
@@ -425,8 +421,6 @@ class KeypointSettings(Settings):
     """folder for the results; the same settings continue interrupted ones"""
     pictures: NonNegativeInt = 2
     """number of pairs whose matches are drawn"""
-    export: bool = False
-    """true: write keypoints and matches as COLMAP databases"""
 
 
 class RunSettings(Settings):
@@ -515,6 +509,14 @@ class FilesSettings(RunSettings):
     depth_channel: str | None = None
     """predictions: channel of OpenEXR files; null = as tangent-predict"""
 
+    @model_validator(mode="after")
+    def _check_predictions(self) -> Self:
+        """Refuse settings that are read with predictions only."""
+        if self.predictions is None:
+            of_files = {"values", "files", "resample", "depth_scale", "depth_channel"}
+            check_read(self, type(self).model_fields.keys() - of_files)
+        return self
+
 
 class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
     """Settings of tangent-evaluate."""
@@ -547,13 +549,13 @@ class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
     level: Level | None = None  # type: ignore[assignment]
     """level s, the angular resolution; null = as in the checkpoint"""
 
-
-class PrepareSettings(RunSettings):
-    """Settings of tangent-prepare."""
-
-    # --- performance ---
-    shard: str | int | None = None
-    """part of the cache for this process, e.g. 3/16; null = all"""
+    @model_validator(mode="after")
+    def _check_network(self) -> Self:
+        """Refuse an evaluation of nothing."""
+        if self.checkpoint is None and self.predictions is None:
+            expected = "a network, or predictions=<folder>"
+            raise SettingError("checkpoint", found="null", expected=expected)
+        return self
 
 
 class PhotoSettings(Settings):
@@ -635,7 +637,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "render": RenderSettings,
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
-    "prepare": PrepareSettings,
+    "prepare": RunSettings,
     "check": FilesSettings,
 }
 """Settings by the name of the command."""

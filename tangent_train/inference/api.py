@@ -45,6 +45,7 @@ from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
+from tangent_train.heads.objects import described
 from tangent_train.inference.engine import Predictor, UpLikelihood, views_per_forward
 from tangent_train.inference.images import (
     InputImage,
@@ -73,8 +74,6 @@ Depth = Tensor | NDArray[Any] | None
 
 _Stored = str | Path | Image.Image | NDArray[Any]
 """Pictures whose results are arrays."""
-
-_SHOWN = 6
 
 
 class ImageSettings(TypedDict, total=False):
@@ -186,14 +185,6 @@ class Network:
         self.palette = class_colors(tuple(loaded.class_names))
         self._predictor, self._up_likelihood = predictor, up_likelihood
 
-    def __repr__(self) -> str:
-        """Return classes or kind of depth, inputs and device in one line."""
-        loaded, names = self.loaded, self.class_names[1:]
-        shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
-        predicts = f"{len(names)} classes ({shown})" if names else f"depth ({loaded.depth_kind})"
-        inputs = ", ".join(loaded.inputs)
-        return f"<Network of {predicts}, inputs {inputs}, on {self._predictor.device}>"
-
     @overload
     def labels(self, image: Tensor, **settings: Unpack[LabelSettings]) -> Tensor: ...
     @overload
@@ -217,7 +208,8 @@ class Network:
         Args:
             image: A panorama, or a photo.
             depth: ``(H, W)`` floats in meters, 0 or NaN where missing, for networks with depth as
-                an input: distance from the center for panoramas, z-depth for photos.
+                an input, and for the distances of objects: distance from the center for panoramas,
+                z-depth for photos.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
             area: West, east, south and north of a part of a panorama in degrees, see
                 `read_area`. None to use the GPano tags of a file, or the whole sphere
@@ -268,7 +260,7 @@ class Network:
         given = self._read(image, **settings)
         mosaic = self._predictor.predict(given)
         found = given.cut(mosaic.pixels().cpu().numpy())
-        return found, mosaic.facts["objects"]
+        return found, described(mosaic.facts["objects"], self.loaded.class_names[1:], given)
 
     @overload
     def depth(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
@@ -357,12 +349,13 @@ class Network:
     def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16]:
         """Return depth in steps of 1/512 m, of the size of the image."""
         array = depth.numpy(force=True) if isinstance(depth, Tensor) else np.asarray(depth)
-        is_read = "depth" in self.loaded.inputs
+        is_read = "depth" in self.loaded.inputs or self.loaded.things
         if not is_read or (array.shape, array.dtype.kind) != (size, "f"):
             raise SettingError(
                 "depth",
                 found="none" if depth is None else f"shape {array.shape} of {array.dtype}",
-                expected=f"floats in meters, {width_height(size)}, for a network that takes depth",
+                expected=f"floats in meters, {width_height(size)}, for a network that takes depth "
+                "or returns objects",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -56,17 +55,16 @@ def test_shares_and_classes_that_do_not_occur(root: Path, capsys: Capture) -> No
     assert "0 problems and 2 warnings; 3 panoramas of" in err
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_stereo_panoramas_are_among_the_problems(root: Path, capsys: Capture, suffix: str) -> None:
+def test_stereo_panoramas_are_among_the_problems(root: Path, capsys: Capture) -> None:
     """One picture with two halves of 180°, as its tags say, has the size of a panorama."""
     (root / "images" / "b.png").unlink()
-    save_tagged(root / "images" / f"b{suffix}", {"StereoMode": "left-right"}, (32, 64))
+    save_tagged(root / "images" / "b.jpg", {"StereoMode": "left-right"}, (32, 64))
     write_classes(root, [None, "door", "wall", "floor", "sofa"])
     with pytest.raises(SystemExit) as ended:
         _checked(root, capsys)
     assert ended.value.code
     out = " ".join(capsys.readouterr().out.split())
-    assert f"b{suffix} a stereo panorama (left-right), by its metadata" in out
+    assert "b.jpg a stereo panorama (left-right), by its metadata" in out
 
 
 def test_colors_of_12_bits_are_among_the_warnings(
@@ -80,17 +78,6 @@ def test_colors_of_12_bits_are_among_the_warnings(
     _out, err = _checked(root, capsys, "data.num_workers=0")
     assert "a.png: the largest value of 16-bit colors is 4095" in err
     assert "0 problems and 3 warnings; 3 panoramas of" in err
-
-
-def test_classes_of_other_labels(root: Path, capsys: Capture) -> None:
-    """By one off, almost everything is unknown."""
-    classes: dict[str, Any] = {"door": 11, "wall": 12, "floor": 13, "sofa": 4}
-    write_classes(root, classes)
-    _, err = _checked(root, capsys)
-    assert "Nothing is wrong" not in err
-    assert "Warning: 75.0 % of the pixels for train are unknown." in err
-    assert "Classes without a pixel for train: door, wall, floor (3 of 4)." in err
-    assert "Warning: 100.0 % of the pixels for test are unknown." in err
 
 
 def test_nothing_is_wrong(root: Path, capsys: Capture) -> None:
@@ -123,17 +110,15 @@ def test_distances_are_counted_and_stored(tmp_path: Path, capsys: Capture) -> No
     assert np.unique(stored["labels"]).tolist() == [0, 3 * 512]
 
 
-def test_the_views_of_an_area_are_counted(tmp_path: Path, capsys: Capture) -> None:
+def test_images_of_another_shape_than_the_area_are_named(tmp_path: Path, capsys: Capture) -> None:
     write_classes(tmp_path, [None, "door"])
     for name in ("a", "b", "c"):
         save(tmp_path / "images" / f"{name}.png", np.zeros((12, 64, 3), np.uint8))
         save(tmp_path / "labels" / f"{name}.png", np.ones((12, 64), np.uint8))
     (tmp_path / "test.txt").write_text("a")
     area = "[-180,180,-33.75,33.75]"
-    expected = f"Area {area.replace(',', ', ')}: 55.6 % of the sphere; 10 of 20 views, 16 × 16"
-    _, err = _checked(tmp_path, capsys, f"data.area={area}")
-    assert expected in err
+    _checked(tmp_path, capsys, f"data.area={area}")
     with pytest.raises(SystemExit):
         _checked(tmp_path, capsys, "data.area=[-180,180,-60,60]")
-    out, err = capsys.readouterr()
+    out = capsys.readouterr().out
     assert out.count("expected 64 × 21.3 (width × height): square pixels in area=") == 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from tangent_train.geometry import equirect_directions, lonlat_to_xyz
 from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tangent_train.metrics.panoptic import LABEL, panoptic_sums, quality
 from tangent_train.photo_networks import PhotoNetwork, import_network
-from tests.cli.tiny_runs import Predict
+from tests.cli.tiny_runs import Predict, Run
+from tests.photo_networks import huggingface_networks as networks
 
 SHAPE = (128, 256)
 UNIT = Normalization([0, 0, 0], [1, 1, 1])
@@ -82,7 +84,12 @@ def test_objects_of_a_panorama(tmp_path: Path, network: Path, predict: Predict) 
     rgb, truth = scene()
     write_pixels(tmp_path / "in" / "hall.png", rgb)
     kinds = "[panoptic,labels,objects,overlay]"
-    entry = predict(checkpoint=network, write=kinds, trust=f"[{TRUST}]")["hall"]
+    distances = (1 + 0.5 * (truth % LABEL)).astype(np.float32)  # of each object another
+    distances[::2] = np.nan
+    (tmp_path / "distances").mkdir()
+    np.save(tmp_path / "distances" / "hall.npy", distances)
+    settings = {"write": kinds, "trust": f"[{TRUST}]", "depth": "distances"}
+    entry = predict(checkpoint=network, **settings)["hall"]
     output = tmp_path / "out"
     colors = read_pixels(output / "panoptic" / "hall.png", indices=False).astype(int)
     codes = colors @ [1, 256, LABEL]
@@ -117,15 +124,17 @@ def test_objects_of_a_panorama(tmp_path: Path, network: Path, predict: Predict) 
         assert lonlat_to_xyz(center) @ expected > np.cos(np.radians(1.5))
         assert float(row["width_deg"]) == pytest.approx(2 * radius, abs=3)
         assert float(row["score"]) == pytest.approx(0.9)
+        assert float(row["distance_m"]) == pytest.approx(1 + 0.5 * number, abs=0.002)
     assert entry["classes"]["wall"] < 1
     report = (output / "report.html").read_text()
-    assert "chair 1, score 0.90" in report
+    assert '"1":{"number":1,"class":"chair","score":0.9,' in report
 
 
 def test_python_returns_labels_and_objects(network: Path) -> None:
     rgb, truth = scene()
     loaded = tt.load(network, trust=TRUST)
-    codes, objects = loaded.panoptic(rgb)
+    codes, objects = loaded.panoptic(rgb, depth=np.full(SHAPE, 2.5))
+    assert {each["distance_m"] for each in objects} == {2.5}
     assert [each["class"] for each in objects] == [NAMES[disc[3]] for disc in DISCS]
     labels = loaded.labels(rgb)
     assert labels.dtype == np.uint8
@@ -140,3 +149,28 @@ def test_networks_without_objects_are_refused(tmp_path: Path) -> None:
     import_network(photo, tmp_path / "net.ckpt")
     with pytest.raises(SettingError, match="one without objects"):
         tt.load(tmp_path / "net.ckpt", trust=TRUST).panoptic(scene()[0])
+
+
+@pytest.mark.parametrize("made", [networks.maskformer, networks.oneformer])
+def test_universal_networks_of_the_library(
+    tmp_path: Path, run: Run, predict: Predict, made: Callable[[], Any]
+) -> None:
+    def sure_of_floors() -> networks.Made:
+        network, processor = made()
+        (bias,) = (p for p in network.parameters() if p.shape == (len(networks.NAMES) + 1,))
+        bias.data[1] += 5
+        return network, processor
+
+    networks.tokenizer(tmp_path / "net")
+    networks.saved(sure_of_floors, tmp_path / "net")
+    run("import", "library=huggingface", "model=net", "things=[floor,car]", "output=net.ckpt")
+    rgb = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    write_pixels(tmp_path / "in" / "hall.png", rgb)
+    predict(checkpoint="net.ckpt", write="[panoptic,objects]")
+    rows = list(csv.DictReader((tmp_path / "out" / "objects.csv").read_text().splitlines()))
+    numbers = read_pixels(tmp_path / "out" / "objects" / "hall.png", indices=True)
+    assert rows
+    assert {int(row["number"]) for row in rows} == set(np.unique(numbers[numbers > 0]).tolist())
+    assert {row["class"] for row in rows} == {"floor"}
+    assert all(0.5 < float(row["score"]) <= 1 for row in rows)
+    assert '"1":{"number":1,"class":"floor",' in (tmp_path / "out" / "report.html").read_text()

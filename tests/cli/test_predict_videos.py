@@ -67,7 +67,7 @@ def _labels(folder: Path) -> dict[str, NDArray[np.uint8]]:
     return {path.stem: read_png(path) for path in sorted(folder.rglob("*.png"))}
 
 
-@pytest.mark.parametrize("quarters", [0, 1, 2])
+@pytest.mark.parametrize("quarters", [0, 1])
 def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
     tmp_path: Path, predict: Predict, quarters: int
 ) -> None:

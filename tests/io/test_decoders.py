@@ -83,7 +83,6 @@ def _ink_profile() -> bytes:
 
 _PROFILES = {
     "Display P3": _rgb_profile(((0.68, 0.32), (0.265, 0.69), (0.15, 0.06))),
-    "Adobe RGB": _rgb_profile(((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))),
     "ProPhoto": _rgb_profile(
         ((0.7347, 0.2653), (0.1596, 0.8404), (0.0366, 0.0001)), (0.3457, 0.3585), 1.8
     ),
@@ -98,17 +97,14 @@ _COLORS = np.kron(np.random.default_rng(0).integers(20, 236, (4, 8, 3)), np.ones
 _SAVED: dict[str, tuple[str, dict[str, Any]]] = {
     "a.png": ("RGB", {}),
     "alpha.png": ("RGBA", {}),
-    "palette.png": ("P", {}),
     "a.jpg": ("RGB", {"quality": 90}),
     "a.tif": ("RGB", {"compression": "tiff_lzw"}),
     "a.webp": ("RGB", {"lossless": True}),
     "a.avif": ("RGB", {}),
     "a.heic": ("RGB", {}),
     "gray of colors.jpg": ("L", {}),
-    "gray.png": ("L", {}),
     "gray alpha.png": ("LA", {}),
     "inks.jpg": ("CMYK", {"quality": 95}),
-    "inks.tif": ("CMYK", {}),
 }
 
 
@@ -123,7 +119,9 @@ def _of_lcms(image: Image.Image, profile: bytes) -> NDArray[np.int16]:
 def test_embedded_profiles_are_converted_to_srgb(tmp_path: Path, name: str) -> None:
     mode, settings = _SAVED[name]
     kinds = [name.partition(".")[0].split()[0]]
-    kinds = kinds if kinds[0] in _PROFILES and "of colors" not in name else list(_PROFILES)[:5]
+    kinds = (
+        kinds if kinds[0] in _PROFILES and "of colors" not in name else ["Display P3", "swapped"]
+    )
     for kind in kinds:
         path = tmp_path / name
         Image.fromarray(_COLORS).convert(mode).save(path, icc_profile=_PROFILES[kind], **settings)

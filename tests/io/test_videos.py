@@ -35,7 +35,6 @@ _CODECS: dict[str, tuple[str, str, dict[str, str]]] = {
     "forward": ("libx264", "yuv420p", {"bf": "0", "g": "6"}),
     "mpeg4": ("mpeg4", "yuv420p", {"bf": "2"}),
     "mjpeg": ("mjpeg", "yuvj420p", {}),
-    "ffv1": ("ffv1", "yuv420p", {}),
     "prores": ("prores_ks", "yuv422p10le", {}),
     "vp8": ("libvpx", "yuv420p", {"lag-in-frames": "16", "auto-alt-ref": "1"}),
     "vp9": ("libvpx-vp9", "yuv420p", {"lag-in-frames": "16"}),
@@ -96,23 +95,15 @@ def _read(path: Path) -> list[NDArray[np.uint8]]:
 _WHOLE = [
     ("x264.mp4", {}),
     ("x264.mov", {"times": _UNEVEN}),
-    ("x264.m4v", {}),
-    ("x264.mkv", {"sound": 3}),
     ("x264.avi", {"sound": 3}),
     ("x264.mp4", {"movflags": "frag_keyframe+empty_moov"}),
-    ("x264.mp4", {"times": range(50, 99)}),
     ("x264.mkv", {"live": "1"}),
     ("opengop.mkv", {}),
     ("mpeg4.avi", {"times": _UNEVEN}),
-    ("mjpeg.avi", {"frames": _pictures(1)}),
     ("mjpeg.mov", {}),
-    ("ffv1.mkv", {"times": _UNEVEN}),
     ("prores.mov", {}),
-    ("vp8.webm", {}),
     ("vp9.webm", {"times": _UNEVEN}),
-    ("av1.webm", {"frames": _pictures(1)}),
     ("av1.mp4", {"times": _UNEVEN}),
-    ("lossless.avi", {}),
 ]
 
 
@@ -127,8 +118,8 @@ def test_whole_videos_are_read(tmp_path: Path, name: str, settings: dict[str, An
     np.testing.assert_array_equal(every, _decoded(path)[::5])
 
 
-@pytest.mark.parametrize("codec", ["x264", "mpeg4", "mjpeg", "vp9", "opengop"])
-@pytest.mark.parametrize("hidden", [1, 5, 11])
+@pytest.mark.parametrize("codec", ["x264", "mjpeg", "opengop"])
+@pytest.mark.parametrize("hidden", [1, 11])
 def test_frames_that_an_edit_list_hides_do_not_count(
     tmp_path: Path, codec: str, hidden: int
 ) -> None:
@@ -179,9 +170,10 @@ def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
     np.testing.assert_array_equal(_read(path), _decoded(path))
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-@pytest.mark.parametrize("quarter_turns", range(4))
-@pytest.mark.parametrize("mirrored", ["", "hflip", "vflip"])
+@pytest.mark.parametrize(
+    ("suffix", "quarter_turns", "mirrored"),
+    [(".mp4", 1, ""), (".mkv", 3, ""), (".mp4", 0, "hflip"), (".mkv", 1, "vflip")],
+)
 def test_frames_are_upright(tmp_path: Path, suffix: str, quarter_turns: int, mirrored: str) -> None:
     """Counterclockwise by quarter quarter_turns, and then mirrored."""
 
@@ -203,22 +195,19 @@ def test_frames_are_upright(tmp_path: Path, suffix: str, quarter_turns: int, mir
     assert np.abs(again - shown).mean() < 20  # compressed, with colors at half resolution
 
 
-@pytest.mark.parametrize("degrees", [3, 30, 45, 60, 100])
-def test_other_rotations_are_refused(tmp_path: Path, degrees: int) -> None:
-    path = _write(tmp_path / "a.mp4", setup=lambda stream: stream.set_display_rotation(degrees))
-    with pytest.raises(DataError, match=rf"a\.mp4: found a rotation by {degrees}°"):
+def test_other_rotations_are_refused(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mp4", setup=lambda stream: stream.set_display_rotation(30))
+    with pytest.raises(DataError, match=r"a\.mp4: found a rotation by 30°"):
         read_video_size(path)
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-@pytest.mark.parametrize("quarter_turns", [0, 1])
 @pytest.mark.parametrize(
-    ("stored", "aspect", "shown"),
+    ("suffix", "quarter_turns", "stored", "aspect", "shown"),
     [
-        ((64, 64), (2, 1), (64, 128)),
-        ((64, 128), (1, 2), (128, 128)),
-        ((64, 96), (4, 3), (64, 128)),
-        ((64, 128), (1001, 1000), (64, 128)),
+        (".mp4", 0, (64, 64), (2, 1), (64, 128)),
+        (".mkv", 1, (64, 128), (1, 2), (128, 128)),
+        (".mp4", 1, (64, 96), (4, 3), (64, 128)),
+        (".mkv", 0, (64, 128), (1001, 1000), (64, 128)),
     ],
 )
 def test_the_display_size_decides(
@@ -357,7 +346,6 @@ def test_high_dynamic_range_becomes_srgb(
     ("name", "settings"),
     [
         ("x264.mp4", {"movflags": "faststart"}),
-        ("x264.mkv", {}),
         ("vp9.webm", {}),
         ("mpeg4.avi", {}),
     ],
@@ -383,7 +371,7 @@ def _packets(path: Path) -> list[tuple[int, int]]:
         return [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
 
 
-@pytest.mark.parametrize("name", ["forward.mp4", "forward.mkv", "forward.avi", "av1.webm"])
+@pytest.mark.parametrize("name", ["forward.mp4", "forward.mkv", "av1.webm"])
 def test_a_damaged_frame_is_an_error_after_those_before(tmp_path: Path, name: str) -> None:
     path = _write(tmp_path / name, name.partition(".")[0])
     whole, data = _decoded(path), bytearray(path.read_bytes())
