@@ -15,6 +15,7 @@ from functools import partial
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 from tangent_train.errors import DataError, SettingError, printable
@@ -49,6 +50,22 @@ def _errors_as_messages(command: str) -> Iterator[None]:
         sys.exit(130)
 
 
+@contextmanager
+def _unused_folder_removed(command: str) -> Iterator[None]:
+    """Remove the run folder of a refused command, if it has only Hydra's files and the log."""
+    from hydra.core.hydra_config import HydraConfig
+
+    try:
+        yield
+    except (DataError, SettingError):
+        config = HydraConfig.get()
+        folder = Path(config.runtime.output_dir)
+        names = {path.name for path in folder.iterdir()} - {f"{command}.log"}
+        if names == {".hydra"} and "run.dir=" not in str(config.overrides.hydra):
+            rmtree(folder)
+        raise
+
+
 def _run(command: str, settings: Any) -> Any:
     """Run a command; runs have a log file."""
     from hydra.core.hydra_config import HydraConfig
@@ -69,14 +86,9 @@ def _main(command: str) -> None:
     import hydra
 
     from tangent_train.cli.processes import OF_SWEEPS, in_sweep, run_job
+    from tangent_train.config.command_line import check_words, with_help
     from tangent_train.config.help import annotate, listed_by_files
-    from tangent_train.config.settings import (
-        SETTINGS,
-        config_name,
-        missing_groups,
-        refuse_typed,
-        validate,
-    )
+    from tangent_train.config.settings import config_name, missing_groups, refuse_typed, validate
     from tangent_train.files import config_folder
 
     def job(config: Any) -> Any:
@@ -84,14 +96,16 @@ def _main(command: str) -> None:
         if in_sweep() and not missing:  # outside the block: the other jobs go on
             return run_job(command)
         # Inside: Hydra prints a line for other exceptions.
-        with _errors_as_messages(command):
+        with _errors_as_messages(command), _unused_folder_removed(command):
             refuse_typed(OF_SWEEPS, f"a sweep: tangent-{command} -m …")
-            unread = f"no such setting: tangent-{command} does not read it"
-            refuse_typed(SETTINGS[command].not_read, unread)
-            return _run(command, validate(command, config, missing))
+            settings = validate(command, config, missing)
+            import_module("tangent_train.cli.paths").check_paths(settings)
+            return _run(command, settings)
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors are raised here, not printed by Hydra
     with _errors_as_messages(command):
+        sys.argv[1:] = with_help(sys.argv[1:])
+        check_words(command, sys.argv[1:])
         name = config_name(command, sys.argv[1:])
         run = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)
         if {"--help", "-h"}.isdisjoint(sys.argv):
@@ -112,12 +126,13 @@ def _print_version(command: str) -> None:
 
 
 def report() -> None:
-    """Run ``tangent-report <run folders>``: write tables over runs."""
+    """Run ``tangent-report <run folders>``: write tables and a chart over runs."""
     _print_version("report")
     from tangent_train.cli.report import report as write_report
+    from tangent_train.config.command_line import with_help
 
     with _errors_as_messages("report"):
-        write_report(sys.argv[1:])
+        write_report(with_help(sys.argv[1:]))
 
 
 def overview() -> None:

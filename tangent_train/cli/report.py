@@ -11,7 +11,7 @@ from tangent_train.console import print_text
 
 
 def report(arguments: Sequence[str]) -> None:
-    """Read runs, print the table, and write ``report.md`` and ``.csv``.
+    """Read runs, print the table, and write ``report.md``, ``.csv`` and ``.png``.
 
     Args:
         arguments: Command line after the program's name.
@@ -27,7 +27,7 @@ def report(arguments: Sequence[str]) -> None:
     )
     of_folders = "folders of runs, or folders with runs below them"
     parser.add_argument("folders", nargs="+", type=Path, help=of_folders)
-    of_output = "folder for report.md and report.csv (default: report)"
+    of_output = "folder for report.md, report.csv and report.png (default: report)"
     parser.add_argument("--output", type=Path, default=Path("report"), help=of_output)
     options = parser.parse_args(arguments)
     # Slow imports, not needed to refuse a command line.

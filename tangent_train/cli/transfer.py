@@ -117,9 +117,7 @@ def _take_settings(config: Any, loaded: LoadedNetwork) -> None:
         views = panorama_settings(loaded, config.level if "level" in typed else None)
         rows = config.representation.get("erp_height")
         config.representation = views | ({} if rows is None else {"erp_height": rows})
-    mean, std = map(list, (loaded.normalization.mean, loaded.normalization.std))
-    of_network = {"inputs": list(loaded.inputs), "normalization": {"mean": mean, "std": std}}
-    config.data = {**config.data, **of_network}
+    config.data = {**config.data, **loaded.data_settings}
     if "task.eval_view_batch_size" not in typed:  # photo networks have many classes, large images
         config.task.eval_view_batch_size = views_per_forward(loaded.image_size)
 
@@ -286,7 +284,7 @@ def _run(stage: Stage, settings: Mapping[str, Any], manifest: Manifest, heading:
 
 
 def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
-    """Write and print the tables."""
+    """Write and print the tables and the chart."""
     results: dict[Any, list[Any]] = defaultdict(list)
     for stage in stages:
         key = stage.changes["level"] if config.study_levels and stage.view else stage.name
@@ -299,7 +297,7 @@ def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
         name, report = "transfer", transfer_report(results, cells)
     report.write(folder, name)
     report.print()
-    print_text(f"Tables: {folder / name}.md, .csv")
+    print_text(f"Tables and a chart: {folder / name}.md, .csv, .png")
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
+from tangent_train.heads.objects import described
 from tangent_train.inference.engine import Predictor, UpLikelihood, views_per_forward
 from tangent_train.inference.images import (
     InputImage,
@@ -54,11 +55,10 @@ from tangent_train.inference.images import (
     with_up,
 )
 from tangent_train.inference.views import Levels, ViewChoice, ViewSelector
-from tangent_train.io.gpano import Fill
+from tangent_train.io.gpano import Eye, Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
-from tangent_train.metrics.panoptic import LABEL
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
 from tangent_train.rendering.forward import check_grid, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic, blend_back
@@ -82,6 +82,7 @@ class ImageSettings(TypedDict, total=False):
     area: Sequence[float] | None
     upright: Upright
     mask: Mask | str | NDArray[Any] | Tensor
+    eye: Eye | None
 
 
 class LabelSettings(ImageSettings, total=False):
@@ -199,13 +200,15 @@ class Network:
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
+        eye: Eye | None = None,
     ) -> NDArray[Any] | Tensor:
         """Return the label of every pixel.
 
         Args:
             image: A panorama, or a photo.
             depth: ``(H, W)`` floats in meters, 0 or NaN where missing, for networks with depth as
-                an input: distance from the center for panoramas, z-depth for photos.
+                an input, and for the distances of objects: distance from the center for panoramas,
+                z-depth for photos.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
             area: West, east, south and north of a part of a panorama in degrees, see
                 `read_area`. None to use the GPano tags of a file, or the whole sphere
@@ -215,6 +218,7 @@ class Network:
             max_tilt_deg: Largest tilt that ``auto`` considers, in degrees.
             mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
                 a file; or 0 in an array or tensor. See `Masks`.
+            eye: Eye of a stereo panorama, see `eye_part`; the labels are those of its picture.
 
         Returns:
             ``(H, W)`` labels 1 … K, and 0 for unknown pixels: an array of uint8 (uint16 for many
@@ -225,10 +229,9 @@ class Network:
             SettingError: The image cannot be used, or the network needs another input.
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        given = self._read(image, depth, fov, area, upright, max_tilt_deg)
-        found = self._predictor.predict(given).pixels().cpu().numpy()
-        if self.loaded.things:
-            found = (found // LABEL).astype(np.uint8)
+        given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye)
+        head: Any = self._predictor.head
+        found = head.labels_in(self._predictor.predict(given).pixels().cpu().numpy())
         return _as_given(_masked(found, given, image, mask, 0), image)
 
     def panoptic(
@@ -255,7 +258,7 @@ class Network:
         given = self._read(image, **settings)
         mosaic = self._predictor.predict(given)
         found = given.cut(mosaic.pixels().cpu().numpy())
-        return found, mosaic.facts["objects"]
+        return found, described(mosaic.facts["objects"], self.loaded.class_names[1:], given)
 
     @overload
     def depth(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
@@ -273,7 +276,7 @@ class Network:
         Args:
             image: A panorama, or a photo.
             mask: Pixels of a panorama that get NaN, see `labels`.
-            **settings: ``fov``, ``area`` and ``upright`` of `labels`. Of ``upright``, only
+            **settings: ``fov``, ``area``, ``upright`` and ``eye`` of `labels`. Of ``upright``, only
                 ``pose`` suits a depth network.
 
         Returns:
@@ -326,6 +329,7 @@ class Network:
         area: Sequence[float] | None = None,
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
+        eye: Eye | None = None,
     ) -> InputImage:
         """Return a photo, or a panorama with its zenith."""
         is_given = depth is not None or "depth" in self.loaded.inputs
@@ -334,7 +338,8 @@ class Network:
             return read_photo(image, fov, of_size)
         check_choice("upright", upright or "pose", ("pose", "auto"))
         check_type("max_tilt_deg", max_tilt_deg, Real, "degrees")
-        panorama = read_panorama(image, area, upright, of_size)
+        check_choice("eye", eye or "left", ("left", "right"))
+        panorama = read_panorama(image, area, upright, of_size, eye)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._up_likelihood)
         return panorama
@@ -342,12 +347,13 @@ class Network:
     def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16]:
         """Return depth in steps of 1/512 m, of the size of the image."""
         array = depth.numpy(force=True) if isinstance(depth, Tensor) else np.asarray(depth)
-        is_read = "depth" in self.loaded.inputs
+        is_read = "depth" in self.loaded.inputs or self.loaded.things
         if not is_read or (array.shape, array.dtype.kind) != (size, "f"):
             raise SettingError(
                 "depth",
                 found="none" if depth is None else f"shape {array.shape} of {array.dtype}",
-                expected=f"floats in meters, {width_height(size)}, for a network that takes depth",
+                expected=f"floats in meters, {width_height(size)}, for a network that takes depth "
+                "or returns objects",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
 

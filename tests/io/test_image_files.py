@@ -61,7 +61,6 @@ def test_patterns_select_images(tmp_path: Path) -> None:
     ("pattern", "found"),
     [
         ("nowhere.jpg", "found no such file or folder"),
-        ("*.txt", "found 1 files, none of them an image: 1 .txt"),
         ("notes", "found 2 files, none of them an image: 1 .pdf, 1 .txt"),
         ("empty", "found nothing"),
     ],
@@ -76,9 +75,7 @@ def test_missing_images_are_refused(tmp_path: Path, pattern: str, found: str) ->
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=rf"{re.escape(pattern)}: {found}.*\.webp") as caught:
         image_paths(tmp_path / pattern)
-    assert ("Convert images of other formats" in str(caught.value)) == (
-        "2 files" in found or "1 files" in found
-    )
+    assert ("Convert images of other formats" in str(caught.value)) == ("2 files" in found)
 
 
 def test_depth_is_found_by_the_name_of_the_image(tmp_path: Path) -> None:
