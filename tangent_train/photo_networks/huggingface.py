@@ -141,12 +141,11 @@ def load(
         network = build_from_file(settings, "network", path)
         _load_tensors(network, tensors_in(folder), folder)
     settings["config"] = architecture(network.network.config.to_dict())
-    given = None if normalization is None else Normalization.of(normalization, 3)
     return PhotoNetwork(
         module=network,
         settings=settings,
         score_names=given_names,
-        normalization=given or Normalization(processor["mean"], processor["std"]),
+        normalization=Normalization.of(normalization or processor["normalization"], 3),
         image_size=_image_size(processor, folder / "preprocessor_config.json"),
         score_kind="logits",
         depth_kind=kind,
@@ -192,12 +191,11 @@ def prompted(
     network.network.load_state_dict(without_text(whole).state_dict())
     network.embeddings.copy_(embeddings)
     network.is_token.copy_(is_token)
-    given = None if normalization is None else Normalization.of(normalization, 3)
     return PhotoNetwork(
         module=network,
         settings=settings,
         score_names=(*names, UNKNOWN_NAME),
-        normalization=given or Normalization(processor["mean"], processor["std"]),
+        normalization=Normalization.of(normalization or processor["normalization"], 3),
         image_size=network.fixed_size,
         score_kind="logits",
         things=names if described["model_type"] == "sam3" else (),
@@ -262,7 +260,7 @@ def _predicts_depth(config: Mapping[str, Any], path: Path, depth: DepthKind | No
 def _processor(folder: Path, model_type: str) -> dict[str, Any]:
     """Return settings of the image processor, with the defaults of its class.
 
-    ``do_flip_channel_order``, ``mean`` and ``std`` (for images from 0 to 1) are measured. Settings
+    ``do_flip_channel_order`` and ``normalization`` (for images from 0 to 1) are measured. Settings
     with a text are left out, because some of them are names of files that would be fetched.
 
     Raises:
@@ -295,7 +293,8 @@ def _processor(folder: Path, model_type: str) -> dict[str, Any]:
     numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
     rounded = {n: [float(f"{value:.6g}") for value in values] for n, values in numbers.items()}
     settings: dict[str, Any] = processor.to_dict()
-    return settings | rounded | {"do_flip_channel_order": bool(order[0])}
+    measured = {"normalization": Normalization(**rounded), "do_flip_channel_order": bool(order[0])}
+    return settings | measured
 
 
 def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]] | None:
@@ -377,8 +376,7 @@ def _load_tensors(network: Any, tensors: dict[str, Tensor], folder: Path) -> Non
         raise DataError(
             folder,
             found=f"other weights: {', '.join(wrong[:_LISTED])}",
-            expected=f"weights of {type(inner).__name__} as described in config.json"
-            + ", for the classes in its id2label" * hasattr(network, "is_universal"),
+            expected=f"weights of {type(inner).__name__} as described in config.json",
         )
     inner.load_state_dict(loaded.state_dict())
 
