@@ -48,6 +48,7 @@ def evaluate(settings: EvaluateSettings) -> None:
         expected = "a network, or predictions=<folder>"
         raise SettingError("checkpoint", found="null", expected=expected)
     loaded = load_network(checkpoint, settings.trust)
+    loaded = loaded.prompted(prompts=settings.prompts, threshold=settings.threshold)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])
     loaded.check_predicts(head.kind, remedy)

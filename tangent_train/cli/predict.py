@@ -129,7 +129,9 @@ class _Prediction:
     """
 
     def __init__(self, settings: PredictSettings) -> None:
-        original = loaded = load_network(settings.checkpoint, settings.trust)
+        original = loaded = load_network(settings.checkpoint, settings.trust).prompted(
+            prompts=settings.prompts, threshold=settings.threshold
+        )
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
@@ -299,6 +301,7 @@ class _Prediction:
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     """Return the names of the settings that are read besides those of the head."""
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
+    names |= {"prompts", "threshold"}
     names |= {"levels", "base_level", "blend", "write", "report", "shard"}
     names |= {"view_batch_size", "compile", "device", "trust"}
     panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
