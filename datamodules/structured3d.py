@@ -9,6 +9,8 @@ On disk, as released::
       panorama/<full|simple|empty>/
         rgb_rawlight.png             8 bit; also rgb_warmlight, rgb_coldlight
         semantic.png                 8 bit, with a palette: the index is the class, 0 = unknown
+        instance.png                 16 bit: number of the furniture, from 0; 65535 = background.
+                                     Only in full, from Structured3D_bbox.zip
         depth.png                    16 bit, mm, 0 = missing
       perspective/<full|empty>/<n>/
         …                            the same files of a photo
@@ -29,18 +31,21 @@ from __future__ import annotations
 import math
 from bisect import bisect
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.data_module import data_set
+from datamodules.core.dataset import Labels
 from datamodules.core.files import SPLITS, ImageFiles, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.label_map import LabelMap
+from datamodules.core.label_map import PANOPTIC, LabelMap
 from datamodules.stanford2d3ds.files import EIGHT
 from tangent_train.io.image_files import glob_files
-from tangent_train.io.pixel_files import read_image_size
+from tangent_train.io.pixel_files import read_image_size, read_pixels
+from tangent_train.metrics.panoptic import LABEL
 
 CLASSES: tuple[str, ...] = (
     *("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf"),
@@ -51,9 +56,15 @@ CLASSES: tuple[str, ...] = (
 )
 """The 40 classes of NYUv2 as labels 1 to 40, which are also the numbers in the files."""
 
+THINGS = tuple(
+    name for name in CLASSES if name not in ("wall", "floor", "door", "window", "ceiling")
+)
+"""Classes that have objects in a panoptic map: furniture."""
+
 INVALID = ("01155", "01192", "01714", "01816", "01852", "03398")
 """Scenes that the errata of the release call invalid; published lists of images hold them."""
 
+_BACKGROUND = 65535
 _PUBLISHED = {"train": 18362, "val": 1776, "test": 1697}
 _FIRST = (0, 3000, 3250)
 """First scene of each split."""
@@ -147,7 +158,18 @@ class Structured3DImages(ImageDataModule):
 class Structured3D(Structured3DImages, PanoramaDataModule):
     """The panoramas of Structured3D, 40 or 8 classes."""
 
+    things = THINGS
     place = "panorama/{}"
+
+    def decode_labels(self, files: ImageFiles) -> Labels:
+        """See `ImageDataModule`; furniture without a number is unknown."""
+        labels, path = super().decode_labels(files), cast("Path", files.labels)
+        if self.labels != PANOPTIC:
+            return labels
+        numbers = read_pixels(path.with_name("instance.png"), indices=True)
+        is_thing = np.isin(self.class_names, self.things)[labels]
+        codes = labels * np.int32(LABEL) + (numbers + np.int32(1)) * is_thing
+        return np.where(is_thing & (numbers == _BACKGROUND), 0, codes)
 
 
 @data_set

@@ -21,9 +21,7 @@ from models.pretrained import initialize as initialize
 from models.pretrained import widen_stem as widen_stem
 from models.prompted import PromptedNetwork as PromptedNetwork
 from models.shape_classifier import ShapeClassifier as ShapeClassifier
-from models.sphere_attention import SphereAttention as SphereAttention
 from models.spherical_cnn import SphericalCNN as SphericalCNN
 from models.stages import AuxiliaryHead as AuxiliaryHead
-from models.stages import SphereContext as SphereContext
 from models.unet import UNet as UNet
 from models.zonal import ZonalClassifier as ZonalClassifier

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.segments import Segments
+from models.segments import Segments, front_segments
 from models.unet import check_size
 from tangent_train.errors import SettingError, of_extra
 
@@ -242,11 +242,7 @@ def _segments_of(numbers: Tensor, infos: Sequence[Mapping[str, Any]]) -> Segment
     """Return the library's segments of one image as objects."""
     given = [torch.tensor([info[key] for info in infos]) for key in ("id", "label_id", "score")]
     ids, classes, scores = (values.to(numbers.device) for values in given)
-    is_segment = numbers[None] == ids[:, None, None]
-    order = torch.arange(1, len(infos) + 1, dtype=torch.int32, device=numbers.device)
-    return Segments(
-        (is_segment * order[:, None, None]).sum(0).int(), classes.long(), scores.float()
-    )
+    return front_segments(numbers == ids[:, None, None], classes.long(), scores)
 
 
 _BILINEAR = ("depth_pro", "tipsv2_dpt")

@@ -239,7 +239,7 @@ def initialize(
     """Load matching tensors from a checkpoint, state dict or safetensors file, in place.
 
     Names are matched by `tensors_for`, even if one of the networks is wrapped in another module
-    (`SphereContext`, `AuxiliaryHead`). Filters of the first convolution for input channels that the
+    (`AuxiliaryHead`). Filters of the first convolution for input channels that the
     file lacks start at zero (paper, supplement, "Level 10 parameters"), so RGB-D starts as RGB.
     Other tensors with another shape keep their values, e.g. the last layer for other classes.
 

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from models.harmonic_network import pixel_colatitudes, pixel_row_weights
-from tangent_train.errors import of_extra
 from tangent_train.geometry import equirect_shape
 
 
@@ -116,9 +115,6 @@ class SphericalCNN(nn.Module):
         rings_deg: Angle of each ring of the filters from the pole, in degrees.
         oversampling: Angles of a grid, divided by 2b. ReLU exceeds the bandwidth b, so that with 1,
             as published, scores change slightly under rotation; with 2, about five times less.
-
-    Raises:
-        SettingError: e3nn is missing.
     """
 
     def __init__(
@@ -163,13 +159,11 @@ class SphericalCNN(nn.Module):
 
 def _wigner(bandwidth: int, angles: Tensor) -> Tensor:
     """Return d^l_mn(β), float64 ``(l, β, m, n)``, with order −m at index 2b − m, else zeros."""
-    with of_extra("spectral", "network=spherical_cnn"):
-        from e3nn import o3
     shape = bandwidth, len(angles), 2 * bandwidth, 2 * bandwidth
     matrices = torch.zeros(shape, dtype=torch.float64)
     for degree, matrix in enumerate(matrices):
-        basis = o3.change_basis_real_to_complex(degree, torch.float64)
         m = torch.arange(-degree, degree + 1)
-        real = torch.matrix_exp(angles[:, None, None] * o3.so3_generators(degree)[0])
-        matrix[:, m[:, None], m] = (basis @ real.to(basis) @ basis.mH).real
+        raised = (degree * (degree + 1) - m[:-1] * m[1:]).double().sqrt() / 2
+        generator = torch.diag(raised, 1) - torch.diag(raised, -1)  # −i J_y
+        matrix[:, m[:, None], m] = torch.matrix_exp(angles[:, None, None] * generator)
     return matrices

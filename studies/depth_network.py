@@ -2,7 +2,8 @@
 
 ``python -m studies.depth_network net.onnx --rooms room.png=room.exr --homes zind/sample_tour``
 takes a network that tangent-import wrote, panoramas with their distances in meters, and homes of
-ZInD, whose layouts are known above the horizon: furniture is not in a layout.
+ZInD, whose layouts are known above the horizon: furniture is not in a layout. ``--picture`` draws
+the depth of one panorama instead.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,9 +52,6 @@ _SHAPE = 512, 1024
 """Rows and columns of all panoramas."""
 
 _MODES: tuple[Align, ...] = "none", "scale", "grid"
-_PICTURED = 12
-"""Number of the panorama in the picture."""
-
 _CAMERAS = "ignored", "used"
 _UNALIGNED = "equirectangular image", "six cube faces"
 """Views without overlap, of which all corrections are equal."""
@@ -256,29 +253,31 @@ def table(rows: Sequence[Row], seed: int = 0) -> list[Row]:
     return found
 
 
-def picture(loaded: LoadedNetwork, panorama: Panorama, given: Mapping[str, Any]) -> NDArray[Any]:
-    """Draw a panorama, its known distances, and those of the network, as RGB.
+def picture(loaded: LoadedNetwork, file: Path) -> NDArray[Any]:
+    """Draw a panorama, and the depth of the network with each correction, as RGB.
 
     Args:
-        loaded: The network, whose camera is known.
-        panorama: The panorama.
-        given: Arguments of `ViewSelector`.
+        loaded: The network.
+        file: The panorama; colors of a ``.hdr`` file are cut off at 1 and get a gamma of 2.2.
     """
-    tiles = {"panorama": panorama.image.rgb}
-    known = panorama.distance_m.numpy()
-    limits = distance_limits(known)
-    tiles["room layout"] = colorize_distance(known, limits)
-    for title, kind in (("camera ignored", "metric_z"), ("camera used", "canonical_z")):
-        changes: Any = {"depth_kind": kind}
-        of_kind = replace(loaded, **changes)
-        predictor = Predictor(of_kind, head_of(of_kind), ViewSelector(of_kind, **given))
-        found = predictor.predict(panorama.image).pixels().numpy()
-        tiles[title] = colorize_distance(found, limits)
+    pixels: Any = cv2.imread(str(file), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
+    if pixels.dtype == np.float32:
+        pixels = (255 * pixels.clip(0, 1) ** (1 / 2.2)).round().astype(np.uint8)
+    image = read_panorama(np.ascontiguousarray(pixels[..., ::-1]))
+    found: dict[str, NDArray[Any]] = {}
+    for mode in _MODES:
+        predictor = Predictor(loaded, head_of(loaded, align=mode), ViewSelector(loaded))
+        mosaic = predictor.predict(image)
+        distance, step = mosaic.pixels().numpy(), 100 * mosaic.facts["step_after"]
+        found[f"align={mode}: step between views {step:.0f} %"] = distance
+    limits = distance_limits(*found.values())
+    tiles = {"panorama": image.rgb}
+    tiles |= {title: colorize_distance(distance, limits) for title, distance in found.items()}
     parts = []
     for title, tile in tiles.items():
         small = resize(tile, (256, 512), "bilinear")
         strip = np.full((28, 512, 3), 255, np.uint8)
-        cv2.putText(strip, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
+        cv2.putText(strip, title, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
         parts.append(np.concatenate([strip, small]))
     rows = [np.concatenate(parts[k : k + 2], axis=1) for k in (0, 2)]
     return with_distance_legend(np.concatenate(rows), limits, "m")
@@ -290,20 +289,19 @@ def main() -> None:
     parser.add_argument("network", type=Path)
     parser.add_argument("--rooms", nargs="*", default=[], metavar="IMAGE=DISTANCES")
     parser.add_argument("--homes", type=Path)
+    parser.add_argument("--picture", type=Path, metavar="PANORAMA")
     given = parser.parse_args()
     loaded = load_network(given.network)
+    if given.picture:
+        drawn = picture(loaded, given.picture)[..., ::-1]
+        write_bytes(FOLDER / "depth_network.jpg", cv2.imencode(".jpg", drawn)[1].tobytes())
+        return
     panoramas = [*rooms(given.rooms), *(homes(given.homes) if given.homes else ())]
     found: list[Row] = []
     ratios: list[Row] = []
     for name, options in view_options(loaded).items():
         of_name = measure(loaded, panoramas, name, options)
         found, ratios = found + of_name[0], ratios + of_name[1]
-    of_homes = [panorama for panorama in panoramas if panorama.group != "rooms"]
-    if of_homes:
-        drawn = picture(loaded, of_homes[_PICTURED], {"views": "horizontal"})
-        write_bytes(
-            FOLDER / "depth_network.jpg", cv2.imencode(".jpg", drawn[..., ::-1])[1].tobytes()
-        )
     save("depth_network", table(found))
     save("depth_network_scales", scales(ratios))
 

@@ -125,6 +125,5 @@ def _rendered(data: Any, count: int) -> Iterator[Any]:
             sets.append((images.movedim(1, -1), steps, truth.byte()))
         rgb, depth, labels = (torch.stack(part) for part in zip(*sets, strict=True))
         inputs = normalize((rgb, depth), data.normalization, ("rgb", "depth"))
-        rays = torch.empty(4, 0, 3, 3, device=DEVICE)
         lengths = torch.ones(4, 1, 1, 1)
-        yield Sample(inputs, labels, lengths, torch.arange(4), rays)  # type: ignore[arg-type]
+        yield Sample(inputs, labels, lengths, torch.arange(4))  # type: ignore[arg-type]

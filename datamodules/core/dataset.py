@@ -83,7 +83,6 @@ class Sample(NamedTuple, Generic[_Images]):
         ray_lengths: ``(1 or P, h, w)`` float32, see `Views.ray_lengths`, for distances as labels;
             else a 1, ``(1, 1, 1)``.
         index: Index in its split.
-        rays: ``(P, 3, 3)`` float32 viewing rays, see `world_rays`; or ``(0, 3, 3)``. In training.
         rotation: ``(3, 3)`` float64 rotation of the representation that aligns it with gravity. In
             evaluation.
         valid: ``(H, W)`` bool, valid pixels of a partial panorama; ``(0, 0)`` if all are. In
@@ -94,7 +93,6 @@ class Sample(NamedTuple, Generic[_Images]):
     labels: Tensor
     ray_lengths: Tensor
     index: int  # type: ignore[assignment]  # hides tuple.index
-    rays: Tensor = torch.empty(0, 3, 3)
     rotation: Tensor = torch.eye(3, dtype=torch.float64)
     valid: Tensor = torch.empty(0, 0, dtype=torch.bool)
 
@@ -203,8 +201,7 @@ class ImageDataset(SplitDataset):
             if data.color_jitter:
                 images[0] = jitter_colors(images[0], data.color_jitter, rng)
             labels = view_sets[0].render(image.labels, "nearest")
-            rays = torch.from_numpy(world_rays(view_sets[0], image.up))
-            return Sample(images, _tensor(labels), lengths, index, rays)
+            return Sample(images, _tensor(labels), lengths, index)
         labels = image.labels
         if image.camera_matrix is not None:  # of crops, in which every pixel counts once
             (crops,) = view_sets
@@ -252,17 +249,6 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
         rendered.append(views.render(elevations, "bilinear"))
     # What is rendered may be the panorama itself, shared or a read-only file: copy it.
     return tuple(torch.from_numpy(a) if a.flags.owndata else torch.tensor(a) for a in rendered)
-
-
-def world_rays(views: Views, up: NDArray[np.float64] | None) -> NDArray[np.float32]:
-    """Return viewing rays in a world whose zenith is z, see `Views.rays`.
-
-    Args:
-        views: Views of a panorama.
-        up: Zenith of the panorama; None if it is z.
-    """
-    rays = views.rays()
-    return rays if up is None else upright_rotation(up).T.astype(np.float32) @ rays
 
 
 @lru_cache(maxsize=2)

@@ -11,7 +11,6 @@ from tangent_train.config.settings import ExportSettings
 from tangent_train.console import print_text
 from tangent_train.errors import printable, width_height
 from tangent_train.files import check_new
-from tangent_train.inference.engine import sees_rays
 from tangent_train.inference.export import export_network
 
 
@@ -39,8 +38,6 @@ def export(settings: ExportSettings) -> None:
         f"images: {loaded.in_channels} channels, {sides}; {scores}\n"
         f"largest difference from PyTorch: {written.difference:.1e} of the range of the {of_what}"
     )
-    if output.suffix.lower() == ".onnx" and sees_rays(loaded.network):
-        print_text(f"{output.name} lacks the cross-image attention; .safetensors contains it.")
 
 
 if __name__ == "__main__":

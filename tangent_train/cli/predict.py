@@ -8,36 +8,27 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, suppress
 from functools import partial
-from itertools import groupby
-from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
-import torch
 
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.folder.class_masks import mask_reader
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli import main
+from tangent_train.cli.one_scale import OneScale
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted, listed
-from tangent_train.geometry import PanoramaPose
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
-from tangent_train.heads.scales import frame_scales, pose_scales
 from tangent_train.inference import images
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.engine import Predictor, UpLikelihood
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.jobs import Inputs, Job, work_on
-from tangent_train.keypoints.colmap import poses_from
 from tangent_train.manifest import Manifest, Shard
-from tangent_train.rendering.resampling import resize
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
-
-_MOST_LOG_SCALE = 3.0
-"""Logarithm of a scale above which nothing determines it: without parallax, all large ones fit."""
 
 _COUNTED_IMAGES = 32
 """Images whose confidences are counted for `min_share`, at most."""
@@ -67,32 +58,22 @@ def predict(settings: PredictSettings) -> None:
     if missing:
         prediction.count(inputs)
     prediction.shown = {names[k] for k in evenly_spread(settings.report, len(names))}
-    errors: dict[str, dict[str, Any]] = {}
-
-    def work(title: str, names: Collection[str], step: Any) -> None:
-        steps = step, prediction.read, prediction.write
-        with closing(work_on(title, inputs.jobs(names), len(names), *steps)) as jobs:
-            for job in jobs:
-                if job.error:
-                    errors[job.name] = {"file": str(job.path), **job.place, "error": job.error}
-                else:
-                    manifest.finish(job.name, file=str(job.path), **job.value)
-
-    work("Predicting", missing, prediction.predict)
+    errors = _work("Predicting", inputs, missing, manifest, prediction.predict, prediction)
     manifest = Manifest.open(settings.output, same)  # with what other shards have finished
     left = manifest.missing(names)
     if left and not errors.keys() >= set(left):
         print_text(f"Shard {shard} is done: {len(names) - len(left)} of {len(names)} images.")
     elif len(errors) < len(names):
-        finished = {n: manifest.finished[n] for n in names if n in manifest.finished}
-        work("Scaling", prediction.fit_scales(finished), prediction.scaled)
+        finished = [name for name in names if name not in left]
+        if second := prediction.one_scale:
+            second.fit({name: manifest.finished[name][folder.head.summary] for name in finished})
+            errors |= _work("Scaling", inputs, finished, manifest, second.scaled, prediction)
         errors |= _write_videos(inputs, folder, manifest)
         entries = [{"name": n, **manifest.finished.get(n, errors.get(n, {}))} for n in names]
         folder.write_summary(content, entries)
-        shown = [[*finished][k] for k in evenly_spread(settings.report, len(finished))]
-        if shown:
-            finished = {name: manifest.finished[name] for name in shown}
-            folder.write_page(entries, list(prediction.pictures(inputs, finished)))
+        if shown := [finished[k] for k in evenly_spread(settings.report, len(finished))]:
+            of_shown = {name: manifest.finished[name] for name in shown}
+            folder.write_page(entries, list(prediction.pictures(inputs, of_shown)))
         folder.table(entries).print()
         if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
             count = counted(len(spoiled), "images")
@@ -102,6 +83,26 @@ def predict(settings: PredictSettings) -> None:
     if errors:
         total = len(missing) + done
         sys.exit(f"tangent-predict: {len(errors)} of {total} images could not be used, see above")
+
+
+def _work(
+    title: str,
+    inputs: Inputs,
+    names: Collection[str],
+    manifest: Manifest,
+    step: Callable[..., Any],
+    prediction: _Prediction,
+) -> dict[str, dict[str, Any]]:
+    """Do a step of the work on some images, and write the results; return errors by name."""
+    errors: dict[str, dict[str, Any]] = {}
+    steps = step, prediction.read, prediction.write
+    with closing(work_on(title, inputs.jobs(names), len(names), *steps)) as jobs:
+        for job in jobs:
+            if job.error:
+                errors[job.name] = {"file": str(job.path), **job.place, "error": job.error}
+            else:
+                manifest.finish(job.name, file=str(job.path), **job.value)
+    return errors
 
 
 def _write_videos(
@@ -125,6 +126,7 @@ class _Prediction:
 
     Attributes:
         folder: Output folder.
+        one_scale: Second pass of the prediction, if any.
         shown: Names of the images in the report, whose confidence is kept for it.
     """
 
@@ -149,8 +151,8 @@ class _Prediction:
         title = f"Predictions of {settings.checkpoint.name} ({type(loaded.module).__name__})"
         self.folder = PredictionFolder(settings.output, head, head.file_kinds(kinds), title)
         self.shown: Collection[str] = ()
-        self._scales: dict[str, float] = {}
-        self._finished: Mapping[str, Mapping[str, Any]] = {}
+        across = settings.align_across
+        self.one_scale = across and OneScale(across, settings.output / "unscaled")
         self._confidences: dict[str, Any] = {}
         chosen = settings.levels, settings.base_level, settings.blend, settings.rotations
         views = ViewSelector(loaded, *chosen, settings.views, settings.fill)
@@ -227,10 +229,11 @@ class _Prediction:
             is_counted = image.cut(self._masks(job.name, image.area)) > 0
             unknown = pixels.dtype.type(self._head.unknown)
             predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
-        if self._settings.align_across is None or self._finished:
-            self._head.write(self.folder.files(job), predicted)
+        if self.one_scale and not self.one_scale.facts:
+            unscaled = image.area.place(predicted.pixels)
+            self._head.write_source(self.one_scale.file(job.name), unscaled)
         else:
-            self._head.write_source(self._unscaled(job.name), image.area.place(predicted.pixels))
+            self._head.write(self.folder.files(job), predicted)
         entry: dict[str, Any] = {"rows": pixels.shape[0], "columns": pixels.shape[1]}
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
@@ -240,48 +243,6 @@ class _Prediction:
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
         return entry | self._head.entry(predicted, is_counted)
-
-    def _unscaled(self, name: str) -> Path:
-        return self.folder.path / "unscaled" / f"{name}.npy"
-
-    def fit_scales(self, finished: Mapping[str, Mapping[str, Any]]) -> Collection[str]:
-        """Fit the scales of images to each other, see `align_across`.
-
-        Args:
-            finished: Entries of the images, in their order.
-
-        Returns:
-            Names of the images that `scaled` can return now.
-        """
-        given, poses = self._settings.align_across, dict[str, PanoramaPose]()
-        if given is None:
-            return ()
-        groups = [[*of] for _, of in groupby(finished, lambda name: PurePath(name).parent)]
-        if isinstance(given, Path):
-            poses = {
-                str(PurePath(f).with_suffix("")): pose for f, pose in poses_from(given).items()
-            }
-            groups = [[name for name in finished if name in poses]]
-        self._scales, self._finished = {}, finished
-        for group in (group for group in groups if len(group) > 1):
-            maps = [resize(np.load(self._unscaled(name)), (128, 256), "nearest") for name in group]
-            of_group = [poses[name] for name in group if name in poses]
-            fit = partial(pose_scales, poses=of_group) if of_group else frame_scales
-            found, steps = fit(np.stack(maps))
-            if np.abs(np.log(found)).max() > _MOST_LOG_SCALE:
-                continue
-            self._scales |= zip(group, found.tolist(), strict=True)
-            text = "{:.1%} before, {:.1%} after".format(*steps)
-            print_text(f"One scale for {len(group)} images: median step between them {text}.")
-        if alone := [name for name in finished if name not in self._scales]:
-            print_text(f"Nothing determines the scale of {listed(alone)}.")
-        return finished
-
-    def scaled(self, job: Job, _: Callable[[float], object]) -> tuple[Any, ...]:
-        """Return a finished image at its scale, as `predict` does; the unscaled depth is kept."""
-        scale, facts = self._scales.get(job.name, 1.0), self._finished[job.name][self._head.summary]
-        pixels = torch.from_numpy(np.load(self._unscaled(job.name)) * np.float32(scale))
-        return job.value, (pixels, {**facts, "scale": scale})
 
     def pictures(self, inputs: Inputs, entries: Mapping[str, Any]) -> Iterator[Any]:
         """Yield compressed images for the report, if the predicted pixels were written.

@@ -9,7 +9,6 @@ and `UpLikelihood` use the engine.
 from __future__ import annotations
 
 import copy
-import inspect
 import math
 from dataclasses import replace
 from functools import cached_property, partial
@@ -23,11 +22,7 @@ from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import STEPS_PER_M, resize_depth
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
 from models.distortion_aware import make_ordinary
-from tangent_train.checkpoints.outputs import (
-    OutputNetwork,
-    named_outputs,
-    network_for_views,
-)
+from tangent_train.checkpoints.outputs import named_outputs, network_for_views
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, random_rotation, rotation_about
 from tangent_train.geometry.sphere import equirect_elevations
@@ -44,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
-    from torch import Tensor, nn
+    from torch import Tensor
 
     from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.heads import Head
@@ -55,7 +50,7 @@ if TYPE_CHECKING:
 
     ViewSet = tuple[Any, ViewImages, Tensor | None]
     """Views that cover the whole image, a `Views` or `range`; their images; and rays if the network
-    takes them."""
+    takes cameras."""
 
 _PIXELS_PER_FORWARD = 2**20
 
@@ -63,13 +58,6 @@ _FOV_DEG = 135.0  # the corners show ceiling and floor, which reveal a wrong dir
 _EXPONENT = 3.0  # fitted to real panoramas of one home, and to synthetic rooms
 _COUNTED = 20  # more, smaller views do not add evidence
 _LEAST = 1e-4
-
-
-def sees_rays(network: nn.Module) -> bool:
-    """Return True if a network takes viewing rays or cameras, e.g. for cross-image attention."""
-    inner: Any = network.network if isinstance(network, OutputNetwork) else network
-    takes_cameras = bool(getattr(network, "takes_cameras", False))
-    return takes_cameras or "rays" in inspect.signature(inner.forward).parameters
 
 
 def views_per_forward(image_size: tuple[int, int]) -> int:
@@ -86,7 +74,7 @@ def scored_views(
     Args:
         network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict that contains
             them under ``"out"``, and for depth optionally ``"confidence"`` ``(n, 1, h, w)``. A
-            network that takes rays is called once for a set with rays, with all views:
+            network that takes cameras is called once for a set with rays, with all views:
             ``network(images, rays[None])``.
         sets: Sets of views.
         per_forward: Number of views per call of the network.
@@ -236,8 +224,8 @@ class Predictor:
         views: Selects the views of an image.
         device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
         view_batch_size: Number of views per call of the network, which limits memory; None for
-            as many as fit into 2^20 pixels. A network that takes rays or cameras gets all views of
-            a panorama at once, and their outputs are kept in memory.
+            as many as fit into 2^20 pixels. The outputs of a network that takes cameras are kept in
+            memory for all views of a panorama.
         compile: Arguments of `torch.compile`, empty for its defaults; None to disable it.
 
     Attributes:
@@ -267,7 +255,7 @@ class Predictor:
         self.head = head
         self._loaded, self._views, self._view_batch_size = loaded, views, view_batch_size
         self._compile = compile
-        self._sees_rays = sees_rays(loaded.network)
+        self._takes_cameras = bool(getattr(loaded.network, "takes_cameras", False))
 
     @cached_property
     def _network_of_panoramas(self) -> Any:
@@ -309,7 +297,7 @@ class Predictor:
         for source, shape, views, rotation in self._views(image):
             rendered = RenderedViews(self._loaded, source, shape, self.device)
             rays: Iterable[Tensor | None] = [None] * len(views)
-            if self._sees_rays:
+            if self._takes_cameras:
                 rays = upright_rays(views, rotation, self.device)
             sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
         mosaic = self.head.mosaic(
@@ -322,7 +310,7 @@ class Predictor:
         )
         per_forward = self._view_batch_size or views_per_forward(self._views.image_size(image))
         network = self._network_of_panoramas if image.is_panorama else self._network_of_photos
-        if self._sees_rays:
+        if self._takes_cameras:
             network = partial(network, view_batch_size=per_forward)
         count = sum(len(views) for views, _, _ in sets)
         joins = getattr(self._loaded.network, "takes_all_views", False)
@@ -367,11 +355,9 @@ class UpLikelihood:
     """Estimates how likely directions are to be up, from the confidence of a network.
 
     A network that was trained on upright images is most confident on upright images. For each
-    direction it gets four horizontal views of 135° that are upright for that direction. A network
-    with cross-image attention gets all views of its representation, with which it was more often
-    right, and a network of whole spheres gets its view. The uncertainty of a view is the mean of 1
-    − confidence over its pixels. The likelihood of a direction is the product of uncertainty⁻³ over
-    up to 20 views.
+    direction it gets four horizontal views of 135° that are upright for that direction; a network
+    of whole spheres gets its own view. The uncertainty of a view is the mean of 1 − confidence over
+    its pixels. The likelihood of a direction is the product of uncertainty⁻³ over up to 20 views.
 
     Args:
         loaded: The network.
@@ -380,8 +366,6 @@ class UpLikelihood:
 
     def __init__(self, loaded: LoadedNetwork, device: torch.device | str = "cpu") -> None:
         self.loaded, self._device = loaded, device
-        self._sees_rays = sees_rays(loaded.network)
-        self._takes_own_views = loaded.is_spherical or self._sees_rays
 
     def __call__(self, image: Any, ups_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return log-likelihoods of directions, up to a common constant.
@@ -407,18 +391,15 @@ class UpLikelihood:
         self, rendered: RenderedViews, up: NDArray[np.float64]
     ) -> NDArray[np.float32]:
         """Return the mean uncertainty of each view."""
-        representation, network, rays = self._representation, self._network, None
+        representation = self._representation
         per_forward = views_per_forward(representation.image_size)
         views = representation.with_rotation(upright_rotation(up)).view_sets()[0]
-        if not self._takes_own_views:
+        if not self.loaded.is_spherical:
             views = views[:4]  # of a cube, without up and down
-        if self._sees_rays:
-            network = partial(network, view_batch_size=per_forward)
-            rays = torch.from_numpy(representation.view_sets()[0].rays()).to(self._device)
-        sets = [(views, rendered.of(views), rays)]
+        sets = [(views, rendered.of(views), None)]
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).nan_to_num(0).mean(dim=(1, 2))
-            for _, scores, _ in scored_views(network, sets, per_forward)
+            for _, scores, _ in scored_views(self._network, sets, per_forward)
         ]
         return torch.cat(found).cpu().numpy()
 
@@ -431,7 +412,7 @@ class UpLikelihood:
     def _representation(self) -> Any:
         """The views of an upright panorama."""
         loaded = self.loaded
-        if self._takes_own_views:
+        if loaded.is_spherical:
             return ViewSelector(loaded).representation
         quarter = round(2 / TangentGrid(0, loaded.level).pitch)  # pixels of 90° at its level
         least = quarter if loaded.fixed_size is None else max(loaded.fixed_size)

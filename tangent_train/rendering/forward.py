@@ -71,19 +71,14 @@ def equirect_to_tangent(
         SettingError: The panorama, a face or the interpolation cannot be used.
     """
     if is_tensor(image):
-        from tangent_train.rendering.traced import is_traced, traced
+        from tangent_train.rendering.tensors import render_tensor
 
-        if is_traced():
-            return traced("equirect_to_tangent", image, grid, faces, interpolation)
+        return render_tensor(image, grid, faces, interpolation)
     check_panorama(image, interpolation)
     check_grid(grid)
     if interpolation == "bilinear":
         image = reduce_to_pitch(image, min(grid.pitches))
     indices, (rows, columns) = grid.face_indices(faces), grid.size
-    if is_tensor(image):
-        from tangent_train.rendering.tensors import render_tensor
-
-        return render_tensor(image, grid, indices, interpolation)
     # For random subsets of images, tables are cached per image: subsets rarely repeat.
     is_together = faces is None or grid.rotation is not None
     image = np.ascontiguousarray(image)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from torch import Tensor
+from torch._compile import _disable_dynamo  # torch.compiler.disable would import the compiler now
 
 from tangent_train.geometry.coverage import check_coverage
 from tangent_train.rendering.forward import (
@@ -28,10 +29,9 @@ from tangent_train.rendering.forward import (
 )
 from tangent_train.rendering.numba_sums import NO_SUMS, NumbaSums
 from tangent_train.rendering.representations.views import PinholeViews
-from tangent_train.rendering.resampling import Interpolation, Pixels, is_tensor
+from tangent_train.rendering.resampling import Interpolation, Pixels
 from tangent_train.rendering.tables import nearest_pixels
 from tangent_train.rendering.torch_sums import TorchSums, fits_on
-from tangent_train.rendering.traced import is_traced, traced
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -250,6 +250,7 @@ def blend_back(grid: PinholeGrid, blend: Blend) -> Blend:
     return blend
 
 
+@_disable_dynamo
 def tangent_to_equirect(
     images: Pixels,
     grid: PinholeGrid,
@@ -277,8 +278,6 @@ def tangent_to_equirect(
         SettingError: The images, the shape, the blend or the interpolation cannot be used, or the
             images do not cover the sphere.
     """
-    if is_tensor(images) and is_traced():
-        return traced("tangent_to_equirect", images, grid, shape, blend, interpolation)
     check_array("tangent images", images)
     check_grid(grid)
     blend = blend_back(grid, blend)
@@ -298,6 +297,7 @@ def tangent_to_equirect(
     return result.reshape(*images.shape[:-4], images.shape[-3], *shape)
 
 
+@_disable_dynamo
 def tangent_to_labels(
     logits: Pixels, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
 ) -> Pixels:
@@ -322,8 +322,6 @@ def tangent_to_labels(
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
     """
-    if is_tensor(logits) and is_traced():
-        return traced("tangent_to_labels", logits, grid, shape, blend)
     check_array("scores", logits)
     check_grid(grid)
     scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()

@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch._compile import _disable_dynamo
 from torch.nn.functional import embedding_bag, grid_sample
 
+from tangent_train.rendering.forward import check_grid, check_panorama
+from tangent_train.rendering.resampling import reduce_to_pitch
 from tangent_train.rendering.tables import Value, cached, map_dtype, positions_of_pixels
 
 if TYPE_CHECKING:
@@ -22,6 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from tangent_train.geometry import PinholeGrid
+    from tangent_train.geometry.grids import Faces
     from tangent_train.rendering.resampling import Interpolation
 
 
@@ -49,18 +53,16 @@ def cached_tensors(
     return cached(key, build_normal, is_rotated=is_rotated, device=device)
 
 
+@_disable_dynamo  # NumPy and compiled kernels build the tables
 def render_tensor(
-    image: Tensor, grid: PinholeGrid, faces: NDArray[np.int64], interpolation: Interpolation
+    image: Tensor, grid: PinholeGrid, faces: Faces | None, interpolation: Interpolation
 ) -> Tensor:
-    """Render images ``(..., n, C, h, w)`` of a panorama ``(..., C, H, W)``.
-
-    Args:
-        image: The panorama, floating-point for ``bilinear``.
-        grid: Geometry of the images.
-        faces: ``(n,)`` indices of the images.
-        interpolation: ``bilinear`` or ``nearest``.
-    """
-    positions = _positions(grid, image, faces, interpolation)
+    """Run `equirect_to_tangent` on a tensor."""
+    check_panorama(image, interpolation)
+    check_grid(grid)
+    if interpolation == "bilinear":
+        image = reduce_to_pitch(image, min(grid.pitches))
+    positions = _positions(grid, image, grid.face_indices(faces), interpolation)
     planes = image.flatten(0, -3)
     if interpolation == "nearest":
         values = planes.flatten(-2).index_select(-1, positions.flatten())

@@ -19,7 +19,7 @@ from datamodules.core.dataset import Sample, valid_mask
 from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.errors import SettingError
 from tangent_train.heads import Head
-from tangent_train.inference.engine import add_views, scored_views, sees_rays, upright_rays
+from tangent_train.inference.engine import add_views, scored_views, upright_rays
 from tangent_train.tasks.divergence import check_loss, check_weights
 from tangent_train.tasks.optimization import Schedule, freeze, parameter_groups
 
@@ -98,7 +98,6 @@ class Task(lightning.LightningModule, ABC):
         self.view_batch_size = view_batch_size
         self.auxiliary_weight = auxiliary_weight
         self.eval_view_batch_size = eval_view_batch_size
-        self.sees_rays = sees_rays(network)
         head.num_outputs = getattr(network, "num_outputs", head.num_outputs)
         self.fresh: Collection[str] | None = None
         # A tuple: in a `ModuleList`, their tensors would have second names.
@@ -337,9 +336,8 @@ class PixelTask(Task):
     photo; the outputs are merged and compared with the original labels.
 
     The network is a module ``(B, C, h, w) -> (B, K, h, w)``, or one that returns a dict with this
-    output under ``"out"`` and optionally that of an auxiliary head under ``"aux"``. A network whose
-    `forward` also takes ``rays`` and ``view_batch_size`` gets the viewing rays of its images and
-    bounds its memory (`models.SphereContext`). The arguments are those of `Task`.
+    output under ``"out"`` and optionally that of an auxiliary head under ``"aux"``. The
+    arguments are those of `Task`.
     """
 
     def forward(self, images: Tensor, rays: Tensor | None = None) -> Mapping[str, Tensor]:
@@ -347,14 +345,13 @@ class PixelTask(Task):
 
         Args:
             images: Images ``(n, C, h, w)`` of one or several spheres.
-            rays: Viewing rays ``(spheres, N, 3, 3)`` for networks that take them, see `Views.rays`.
+            rays: Viewing rays ``(1, N, 3, 3)`` for networks that take cameras, see `Views.rays`.
 
         Raises:
             SettingError: The shape of the output does not fit the images or the labels.
         """
         images = images.contiguous(memory_format=self.memory_format)
-        count = self.view_batch_size if self.training else self.eval_view_batch_size
-        returned = self.network(images, *(() if rays is None else (rays, count)))
+        returned = self.network(images) if rays is None else self.network(images, rays)
         outputs = returned if isinstance(returned, Mapping) else {"out": returned}
         found = tuple(outputs["out"].shape)
         expected = (len(images), self.head.num_outputs, *images.shape[-2:])
@@ -373,13 +370,6 @@ class PixelTask(Task):
         truth = self.head.truth(batch.labels.flatten(0, 1))
         lengths = batch.ray_lengths.expand(*batch.labels.shape[:2], *batch.ray_lengths.shape[-2:])
         return batch.images.flatten(0, 1), self.head.targets(truth, lengths.flatten(0, 1))
-
-    def training_parts(self, batch: Any) -> list[Part]:
-        """See `Task`; a network that takes rays gets all images, which it divides."""
-        if self.sees_rays and batch.rays.numel():
-            images, targets = self.training_pairs(batch)
-            return [((images, batch.rays), targets)]
-        return super().training_parts(batch)
 
     def loss_sum(self, outputs: Mapping[str, Tensor], targets: Tensor) -> Tensor:
         """Return the loss, summed over pixels; in training with that of an auxiliary output.
@@ -447,7 +437,9 @@ class PixelTask(Task):
             rotated = rotated.with_rotation(rotation)
         sets = rotated.view_sets(valid)
         readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
-        rays = upright_rays(sets, rotation, images.device) if self.sees_rays else [None] * len(sets)
+        rays: Iterable[Any] = [None] * len(sets)
+        if getattr(self.network, "takes_cameras", False):
+            rays = upright_rays(sets, rotation, images.device)
         how: dict[str, Any] = {"averaged": len(sets) > 1, "device": images.device}
         mosaic = self.head.mosaic(shape, self.representation.blend, valid=valid, **how)
         view_sets = zip(sets, readers, rays, strict=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics.detection import PanopticQuality
 
+from datamodules import structured3d
 from datamodules.stanford2d3ds.files import CLASSES, MISSING_LABEL, THINGS
 from tangent_train.io.pixel_files import write_pixels
 from tangent_train.metrics.collected import PanopticMetric
@@ -144,6 +145,30 @@ def test_a_perfect_network_and_its_files(
     assert len(list((tmp_path / "out" / "panels").iterdir())) == 1
     run("report", "out")
     assert "PQ" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_objects_of_structured3d(tmp_path: Path, run: Run) -> None:
+    """A perfect network; furniture is numbered from 0 in a file of its own."""
+    rgb, codes = scene()
+    values = np.array([0, *(structured3d.CLASSES.index(name) + 1 for name in NAMES)], np.uint8)
+    labels = values[codes // LABEL]
+    numbers = np.where(codes // LABEL == 1, 65535, codes % LABEL - 1).astype(np.uint16)
+    for number in (0, 3000, 3250):
+        room = (
+            tmp_path / "data" / f"scene_{number:05d}" / "2D_rendering" / "7" / "panorama" / "full"
+        )
+        files = {"rgb_rawlight": rgb, "semantic": labels, "instance": numbers}
+        for name, pixels in files.items():
+            write_pixels(room / f"{name}.png", pixels)
+    (tmp_path / "map.json").write_text(json.dumps({name: name for name in NAMES}))
+    photo = PhotoNetwork(Connected(), SETTINGS, NAMES, UNIT, (64, 64), things=NAMES[1:])
+    import_network(photo, tmp_path / "net.ckpt")
+    data = "task=panoptic", "data=structured3d", "data.root=data"
+    given = "checkpoint=net.ckpt", *data, *VIEWS, *COMMON, "panels=0", "hydra.run.dir=out"
+    run("evaluate", *given)
+    scores = results(tmp_path / "out")["scores"]
+    assert scores["rq"] == 1
+    assert min(scores["pq"], scores["pq_seam"], scores["pq_poles"]) > 0.97
 
 
 def test_files_of_predictions(

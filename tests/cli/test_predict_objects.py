@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from tangent_train.geometry import equirect_directions, lonlat_to_xyz
 from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tangent_train.metrics.panoptic import LABEL, panoptic_sums, quality
 from tangent_train.photo_networks import PhotoNetwork, import_network
-from tests.cli.tiny_runs import Predict
+from tests.cli.tiny_runs import Predict, Run
+from tests.photo_networks import huggingface_networks as networks
 
 SHAPE = (128, 256)
 UNIT = Normalization([0, 0, 0], [1, 1, 1])
@@ -140,3 +142,28 @@ def test_networks_without_objects_are_refused(tmp_path: Path) -> None:
     import_network(photo, tmp_path / "net.ckpt")
     with pytest.raises(SettingError, match="one without objects"):
         tt.load(tmp_path / "net.ckpt", trust=TRUST).panoptic(scene()[0])
+
+
+@pytest.mark.parametrize("made", [networks.maskformer, networks.oneformer])
+def test_universal_networks_of_the_library(
+    tmp_path: Path, run: Run, predict: Predict, made: Callable[[], Any]
+) -> None:
+    def sure_of_floors() -> networks.Made:
+        network, processor = made()
+        (bias,) = (p for p in network.parameters() if p.shape == (len(networks.NAMES) + 1,))
+        bias.data[1] += 5
+        return network, processor
+
+    networks.tokenizer(tmp_path / "net")
+    networks.saved(sure_of_floors, tmp_path / "net")
+    run("import", "library=huggingface", "model=net", "things=[floor,car]", "output=net.ckpt")
+    rgb = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    write_pixels(tmp_path / "in" / "hall.png", rgb)
+    predict(checkpoint="net.ckpt", write="[panoptic,objects]")
+    rows = list(csv.DictReader((tmp_path / "out" / "objects.csv").read_text().splitlines()))
+    numbers = read_pixels(tmp_path / "out" / "objects" / "hall.png", indices=True)
+    assert rows
+    assert {int(row["number"]) for row in rows} == set(np.unique(numbers[numbers > 0]).tolist())
+    assert {row["class"] for row in rows} == {"floor"}
+    assert all(0.5 < float(row["score"]) <= 1 for row in rows)
+    assert "floor 1" in (tmp_path / "out" / "report.html").read_text()

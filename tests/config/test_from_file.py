@@ -26,8 +26,8 @@ def test_networks_and_representations_are_built() -> None:
         "level": 4,
     }
     assert isinstance(build_from_file(views, "representation", FILE), TangentRepresentation)
-    partial = {"_target_": "models.SphereAttention", "_partial_": True, "heads": 2, "width": 8}
-    assert build_from_file(partial, "mixer", FILE).keywords == {"heads": 2, "width": 8}
+    partial = {"_target_": "models.mesh_operators", "_partial_": True, "level": 2}
+    assert build_from_file(partial, "table", FILE).keywords == {"level": 2}
 
 
 @pytest.mark.parametrize(

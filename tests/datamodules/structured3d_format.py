@@ -20,6 +20,8 @@ def write_structured3d(
 ) -> Path:
     """Rooms whose labels are vertical stripes of all numbers, and whose depth is 25 mm per number.
 
+    Furniture is numbered by rows, from 0; the first row is background.
+
     The labels have a palette in which the color of a number is another number, and the first of
     five rows of the panoramas is black.
     """
@@ -27,6 +29,8 @@ def write_structured3d(
         room = root / f"scene_{scene:05d}" / "2D_rendering" / f"{scene + 100}"
         for configuration in ("full", "simple", "empty"):
             _write_image(room / "panorama" / configuration, height, 2 * height)
+        objects = np.repeat(np.arange(height, dtype=np.uint16)[:, None], 2 * height, axis=1) - 1
+        write_png(room / "panorama" / "full" / "instance.png", objects)
         for number in range(2 * photos):
             folder = room / "perspective" / "full" / str(number)
             _write_image(folder, height, height)

@@ -33,6 +33,18 @@ def test_a_panorama_is_what_the_files_hold(root: Path, erp: Any) -> None:
         assert set(image.depth[:, np.arange(64) % 41 == number].flat) == {expected}
 
 
+@pytest.mark.parametrize(("classes", "stuff"), [("40", {1, 2, 8, 9, 22}), ("8", {1, 3, 4, 7, 8})])
+def test_furniture_is_numbered(root: Path, erp: Any, classes: str, stuff: set[int]) -> None:
+    """Number + 65536 label; files number furniture from 0, and 65535 is background."""
+    data = Structured3D(root, erp, labels="panoptic", classes=classes)
+    found = data.decode(data.splits()["test"][0]).labels
+    labels = Structured3D(root, erp, classes=classes).decode(data.splits()["test"][0]).labels
+    for (row, column), code in np.ndenumerate(found):
+        label = int(labels[row, column])
+        expected = 65536 * label + (0 if label in stuff else row)
+        assert code == (expected if label and (row or label in stuff) else 0)
+
+
 def test_splits_are_those_of_the_scenes(root: Path, erp: Any) -> None:
     data = Structured3D(root, erp)
     found = {split: [n[6:11] for n in names_of(data, split)] for split in ("train", "val", "test")}

@@ -30,7 +30,6 @@ from tests.inference.trained import (
     sphere,
     trained_network,
 )
-from tests.models.sphere_networks import awake, small_context
 from tests.tasks.builders import predict_labels, segmentation_task
 from tests.tasks.shapes import quiet_trainer
 
@@ -126,14 +125,13 @@ def test_the_validation_loss_is_that_of_the_labels_in_the_area(tmp_path: Path) -
     assert {"val/loss", "val/miou"} < logged[0].keys()
 
 
-@pytest.mark.parametrize("kind", ["tangent", "nearest", "equirectangular", "icosphere", "context"])
+@pytest.mark.parametrize("kind", ["tangent", "nearest", "equirectangular", "icosphere"])
 @pytest.mark.parametrize("up", [None, (0.3, 0.2, 0.9)])
 def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
-    """With a network that sees surroundings, tilted or not, and with cross-image attention."""
+    """With a network that sees surroundings, tilted or not."""
     torch.manual_seed(0)
-    network = awake(small_context()).eval() if kind == "context" else color_network()
-    of = "tangent" if kind == "context" else kind
-    task = _task(of, network)
+    network = color_network()
+    task = _task(kind, network)
     data = _data(write_both(tmp_path)[1], task, fill="reflect")
     panorama = data.dataset("test").read(0)
     zenith = None if up is None else np.array(up) / np.linalg.norm(up)
@@ -146,8 +144,8 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
         batch.rotation[0].numpy(),
         valid=valid_mask(batch.valid[0]),
     )
-    trained = trained_network(KINDS[of], module=network, fill="reflect")
-    same: dict[str, Any] = {n: KINDS[of][n] for n in ("blend", "rotations") if n in KINDS[of]}
+    trained = trained_network(KINDS[kind], module=network, fill="reflect")
+    same: dict[str, Any] = {n: KINDS[kind][n] for n in ("blend", "rotations") if n in KINDS[kind]}
     views = ViewSelector(trained, **same)
     black = data.canvas.place(data.canvas.cut(panorama.rgb))
     image = InputImage(black, up=zenith, area=data.canvas)

@@ -27,10 +27,11 @@ from tangent_train.geometry import (
 )
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
-from tangent_train.inference.engine import Predictor
+from tangent_train.inference.engine import Predictor, upright_rays
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import ViewSelector, view_settings
-from tangent_train.rendering import tangent_to_equirect
+from tangent_train.orientation.gravity import upright_rotation
+from tangent_train.rendering import TangentRepresentation, tangent_to_equirect
 from tangent_train.rendering.representations.views import PinholeViews
 from tests.inference.trained import CUBE, ERP, TANGENT, trained_network
 
@@ -256,3 +257,20 @@ def test_the_documented_network_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     ratio = mosaic.pixels().numpy() / true_distances()
     np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=1e-4)
     assert float(mosaic.facts["rotation_error_deg"]) < 1e-2
+
+
+@pytest.mark.parametrize("tilt_deg", [0, 25, 140])
+def test_rays_of_a_tilted_panorama_point_where_its_pixels_are_in_the_world(tilt_deg: int) -> None:
+    """Tilted about y; the directions of pixels come from a rendered picture of directions."""
+    sine, cosine = np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg))
+    views = TangentRepresentation(0, 5, random_rotation="so3").sample(np.random.default_rng(2))
+    (rays,) = upright_rays([views], upright_rotation([sine, 0, cosine]), "cpu")
+    ahead, right, up = np.moveaxis(
+        views.render(equirect_directions((256, 512)).astype(np.float32), "bilinear"), -1, 0
+    )
+    expected = np.stack([ahead * cosine - up * sine, right, ahead * sine + up * cosine], -1)
+    places = (2 * np.arange(32) + 1) / 32 - 1
+    plane = np.stack([*np.meshgrid(places, places), np.ones((32, 32))], -1)
+    found = np.einsum("nij,hwj->nhwi", np.asarray(rays), plane)
+    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    np.testing.assert_allclose(found, expected, atol=2e-3)

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import distance_from_z_depth
 from datamodules.core.inputs import normalize
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
@@ -38,7 +37,6 @@ from tests.inference.trained import (
     sphere,
     trained_network,
 )
-from tests.models.sphere_networks import awake, small_context
 from tests.tasks.builders import predict_labels, segmentation_task
 
 SGD = functools.partial(torch.optim.SGD, lr=1.0)
@@ -148,24 +146,6 @@ def test_labels_are_those_of_an_evaluation(
     labels = _labels(trained, InputImage(read.rgb, read.depth, read.up), 7, **settings)
     assert len(np.unique(expected)) > 1
     np.testing.assert_array_equal(labels + 1, expected)
-
-
-@pytest.mark.parametrize("per_forward", [7, 1000])
-def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> None:
-    torch.manual_seed(0)
-    network = small_context().eval()
-    awake(network)
-    image, made = InputImage(sphere(32)), build_from_config(TANGENT, "representation")
-    trained = trained_network(TANGENT, module=network)
-    labels = _labels(trained, image, per_forward)
-    task = segmentation_task(network, made, trained.class_names, SGD).eval()
-    (views,) = made.view_sets()
-    rendered = render_inputs(image, views, trained.inputs)
-    images = normalize(rendered, trained.normalization, trained.inputs)
-    expected = predict_labels(task, images, (32, 64)).numpy() - 1
-    np.testing.assert_array_equal(labels, expected)
-    task.sees_rays = False
-    assert (predict_labels(task, images, (32, 64)).numpy() - 1 != expected).any(), "attention"
 
 
 def test_convolutions_are_sampled_on_the_sphere_if_the_views_ask_for_it() -> None:

@@ -11,9 +11,9 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from models import AuxiliaryHead, SphereContext, initialize
+from models import AuxiliaryHead, initialize
 from tangent_train.errors import DataError
-from tests.models.sphere_networks import ATTENTION, STAGE, awake, small_unet
+from tests.models.sphere_networks import STAGE, awake, small_unet
 
 
 def _network(channels: int = 3, classes: int = 5) -> nn.Module:
@@ -152,14 +152,12 @@ def test_a_file_without_a_fitting_tensor_is_refused(tmp_path: Path) -> None:
 
 
 def _wrapped(layers: str) -> nn.Module:
-    """A small UNet, perhaps inside an auxiliary head (``a``) and that inside a context (``c``)."""
+    """A small UNet, perhaps inside an auxiliary head (``a``) and another module (``o``)."""
     network: nn.Module = small_unet()
-    stage = STAGE
     if "a" in layers:
-        network = AuxiliaryHead(network, stage, in_channels=3, num_classes=4)
-        stage = f"network.{stage}"
-    if "c" in layers:
-        network = SphereContext(network, stage, ATTENTION, in_channels=3)
+        network = AuxiliaryHead(network, STAGE, in_channels=3, num_classes=4)
+    if "o" in layers:
+        network = nn.ModuleDict({"network": network, "other": nn.Linear(2, 3)})
     return awake(network)
 
 
@@ -170,11 +168,11 @@ def _plain(network: nn.Module) -> dict[str, Tensor]:
 
 def _kinds(names: Iterable[str]) -> set[str]:
     """The wrappers' own parts that names belong to; others are the UNet's."""
-    parts = ("mixer", "auxiliary_head")
+    parts = ("other", "auxiliary_head")
     return {next((part for part in parts if part in name), "unet") for name in names}
 
 
-@pytest.mark.parametrize(("saved", "wanted"), [("", "ac"), ("ac", ""), ("a", "ac"), ("ac", "c")])
+@pytest.mark.parametrize(("saved", "wanted"), [("", "ao"), ("ao", ""), ("a", "ao"), ("ao", "o")])
 @pytest.mark.parametrize("form", [OURS, LIGHTNING])
 def test_networks_fit_into_each_others_wrappers(
     form: dict[str, Any], saved: str, wanted: str, tmp_path: Path
@@ -182,7 +180,7 @@ def test_networks_fit_into_each_others_wrappers(
     other, network = _wrapped(saved), _wrapped(wanted)
     _save(other.state_dict(), tmp_path / "other.ckpt", **form)
     origins = initialize(network, tmp_path / "other.ckpt")
-    part = {"a": "auxiliary_head", "c": "mixer"}
+    part = {"a": "auxiliary_head", "o": "other"}
     both = {part[layer] for layer in saved if layer in wanted}
     assert _kinds(origins.loaded) == {"unet"} | both
     assert _kinds(origins.fresh) == {part[layer] for layer in wanted if layer not in saved}

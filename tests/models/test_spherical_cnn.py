@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -10,12 +8,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from torch import Tensor
 
-from tangent_train.errors import SettingError
-from tangent_train.geometry import equirect_directions
-
-pytest.importorskip("e3nn")
-
 from models.spherical_cnn import RingCorrelation, SphericalCNN
+from tangent_train.geometry import equirect_directions
 
 Points = NDArray[np.float64]
 
@@ -161,9 +155,3 @@ def test_the_number_of_parameters_is_that_of_the_released_code() -> None:
     network = SphericalCNN(6, 55, 4, [100, 100], [16, 10])
     rings = 6 * 100 * 32 + 100 * 100 * 32
     assert sum(p.numel() for p in network.parameters()) == rings + 2 * 200 + 101 * 55
-
-
-def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "e3nn", None)
-    with pytest.raises(SettingError, match=r"network=spherical_cnn: .*'\.\[spectral\]'"):
-        SphericalCNN(6, 10, 2)

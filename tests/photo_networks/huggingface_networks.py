@@ -85,6 +85,21 @@ def mask2former() -> Made:
     return transformers.Mask2FormerForUniversalSegmentation(config), processor
 
 
+def maskformer() -> Made:
+    decoder = {"encoder_layers": 1, "decoder_layers": 2, "num_queries": 7, "d_model": 32}
+    decoder |= {"encoder_attention_heads": 2, "decoder_attention_heads": 2}
+    decoder |= {"encoder_ffn_dim": 16, "decoder_ffn_dim": 16}
+    config = transformers.MaskFormerConfig(
+        fpn_feature_size=32,
+        mask_feature_size=32,
+        backbone_config=_swin(),
+        decoder_config=transformers.DetrConfig(**decoder),
+        **_LABELS,
+    )
+    processor = transformers.MaskFormerImageProcessor(size=_SIZE)
+    return transformers.MaskFormerForInstanceSegmentation(config), processor
+
+
 def oneformer(**processor_settings: Any) -> Made:
     sizes = {"conv_dim": 32, "mask_dim": 32, "task_seq_len": 24}
     config = transformers.OneFormerConfig(backbone_config=_swin(), **sizes, **_MASKS, **_LABELS)
@@ -181,11 +196,17 @@ def assert_same(scores: Tensor, expected: Tensor) -> None:
 
 def tokenizer(folder: Path) -> Any:
     """Write CLIP's tokenizer with single letters as its vocabulary."""
-    letters = sorted(set("the task is semantic") - {" "})
+    letters = sorted(set("the task is semantic or panoptic") - {" "})
     words = [*letters, *(f"{c}</w>" for c in letters), "<|startoftext|>", "<|endoftext|>"]
     made = transformers.CLIPTokenizer(vocab={w: k for k, w in enumerate(words)}, merges=[])
     made.save_pretrained(folder)
     return made
+
+
+def task_inputs(tokenizer: Any, processor: Any, task: str) -> dict[str, Tensor]:
+    """Return OneFormer's task as the library's processor tokenizes it."""
+    both = transformers.OneFormerProcessor(processor, tokenizer, task_seq_length=24)
+    return {"task_inputs": both(photo(), [task], return_tensors="pt")["task_inputs"]}
 
 
 def change_json(path: Path, **changes: Any) -> None:

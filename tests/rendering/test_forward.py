@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -256,13 +256,6 @@ def test_perspective_images_agree_with_the_textbook(yaw: float, pitch: float, ro
 def test_perspective_images_that_do_not_exist_are_refused(given: Any, message: str) -> None:
     with pytest.raises(SettingError, match=message):
         perspective(np.ones((8, 16)), **given)
-
-
-@pytest.mark.filterwarnings("ignore:.*torch.jit.trace")
-def test_tracing_is_refused() -> None:
-    grid, trace = TangentGrid(0, 3), cast("Any", torch.jit.trace)
-    with pytest.raises(SettingError, match=r"torch\.compile"):
-        trace(lambda image: equirect_to_tangent(image, grid), torch.rand(3, 16, 32))
 
 
 def test_tables_of_an_evaluation_serve_a_training() -> None:

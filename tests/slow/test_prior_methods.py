@@ -100,7 +100,7 @@ def test_trains_resumes_evaluates_and_exports(
 
 OF_SHAPES = {
     "torch_harmonics": ("network=zonal_classifier", "network.widths=[4,8]"),
-    "e3nn": ("network=spherical_cnn", "network.widths=[4,8]", "network.bandwidths=[6,4]"),
+    "torch": ("network=spherical_cnn", "network.widths=[4,8]", "network.bandwidths=[6,4]"),
 }
 """Networks for shapes under rotation, by the package that they need."""
 

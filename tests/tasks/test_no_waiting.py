@@ -13,7 +13,7 @@ from models import AuxiliaryHead, UNet
 from tangent_train.rendering import Blend, TangentRepresentation
 from tangent_train.tasks import PixelTask
 from tests.fake_gpu import fake_gpu
-from tests.models.sphere_networks import STAGE, small_context
+from tests.models.sphere_networks import STAGE
 from tests.tasks.builders import predict_labels, segmentation_task
 
 SHAPE = (64, 128)
@@ -31,8 +31,8 @@ def _unet() -> nn.Module:
 
 @pytest.mark.parametrize(
     "network",
-    [_unet(), AuxiliaryHead(_unet(), STAGE, 4, 4), small_context(_unet(), in_channels=4)],
-    ids=["unet", "auxiliary head", "context"],
+    [_unet(), AuxiliaryHead(_unet(), STAGE, 4, 4)],
+    ids=["unet", "auxiliary head"],
 )
 def test_a_training_step_neither_copies_nor_waits(network: nn.Module) -> None:
     task = _segmentation(network).train()
@@ -40,8 +40,7 @@ def test_a_training_step_neither_copies_nor_waits(network: nn.Module) -> None:
         views = torch.empty(2, 5, 32, 32, 3, dtype=torch.uint8)
         depth, labels = views[..., 0].to(torch.int16), views[..., 0].flatten(0, 1)
         images = normalize((views, depth), RGBD_NORMALIZATION, ("rgb", "depth")).flatten(0, 1)
-        inputs = (images, torch.empty(2, 5, 3, 3)) if task.sees_rays else (images,)
-        loss = task.loss_sum(task(*inputs), labels) / task.head.loss_norm(labels)
+        loss = task.loss_sum(task(images), labels) / task.head.loss_norm(labels)
     assert (loss.device.type, transfers) == ("cuda", [])
 
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils.data import DataLoader
 
 from datamodules.core.dataset import Sample
 from models import AuxiliaryHead
@@ -54,7 +53,7 @@ class Data(Spheres):
             labels = torch.from_numpy(whole.render(truth, "nearest"))
             labels[:7, 1:] = 0
             labels *= len(self.train) != 1
-            self.train.append(Sample(tensor, labels, ONE, 0, torch.tensor(whole.rays())))
+            self.train.append(Sample(tensor, labels, ONE, 0))
             self.test.append(_sample(tensor, torch.from_numpy(truth)))
 
     def class_weights(self, kind: str) -> Tensor:
@@ -170,50 +169,6 @@ def test_intervals_count_absent_classes_as_the_score_does() -> None:
         assert head.scores(result).means["miou"] == expected
         found = intervals(drawn_scores(head.image_sums(result), absent))["miou"]
         assert found == pytest.approx((expected, expected))
-
-
-class Looking(nn.Module):
-    """Says that what is above is `a` and what is below is `b`, by the rays alone."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.scale = nn.Parameter(torch.tensor(0.1))
-        self.received: list[tuple[tuple[int, ...], int | None]] = []
-
-    def forward(
-        self, images: Tensor, rays: Tensor | None = None, view_batch_size: int | None = None
-    ) -> Tensor:
-        if rays is None:
-            rays = torch.eye(3).expand(len(images), 1, 3, 3)
-        self.received.append((tuple(rays.shape), view_batch_size))
-        height, width = images.shape[-2:]
-        y, x = torch.meshgrid(_centers(height), _centers(width), indexing="ij")
-        pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
-        up = torch.einsum("nwc,ijc->nijw", rays.flatten(0, 1), pixels)[..., 2]
-        return self.scale * torch.stack([up, -up], dim=1)
-
-
-def _centers(count: int) -> Tensor:
-    return (2 * torch.arange(count) + 1) / count - 1
-
-
-def test_such_a_network_gets_viewing_rays_and_divides_its_images() -> None:
-    network = Looking()
-    task = _task(network, class_weights=[1.0, 1.0], view_batch_size=3, eval_view_batch_size=7)
-    quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=Data(2))
-    assert network.received == [((2, 20, 3, 3), 3)]
-    network.received.clear()
-    task.representation = TangentRepresentation(0, 4, rotations=2)
-    target = torch.ones(32, 64, dtype=torch.uint8)
-    target[16:] = 2
-    samples: Any = [_sample(torch.zeros(40, 2, 16, 16), target)]
-    quiet_trainer().test(task, DataLoader(samples), verbose=False)
-    assert network.received == [((1, 20, 3, 3), 7)] * 2, "of every rotation"
-    pixels = task.result.pixels
-    assert pixels[1, 1] + pixels[2, 2] == pixels.sum() == 32 * 64
-    network.received.clear()
-    task(torch.zeros(2, 2, 16, 16))
-    assert network.received == [((2, 1, 3, 3), None)]
 
 
 def test_scores_that_do_not_fit_are_refused() -> None:

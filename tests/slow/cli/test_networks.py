@@ -22,9 +22,9 @@ NETWORKS -= {"fcn_resnet_coco"}  # fcn_resnet with weights from the internet
 NETWORKS -= {"depth_anything_3"}  # of a package that is not installed
 NETWORKS -= {*PRIOR_METHODS, "zonal_classifier", "spherical_cnn"}
 OF_SHAPES = {"shape_classifier", "shape_classifier_16"}
-ALIKE = {"unet_small", "unet_context", "fcn_resnet_context"}
+ALIKE = {"unet_small"}
 """Of the same parts as others."""
-DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.network.depth=50"}
+DEPTH = {"fcn_resnet": "network.depth=50"}
 
 
 def _composed(*overrides: str) -> Any:
@@ -46,7 +46,7 @@ def test_every_network_takes_its_data_s_channels_and_classes(network: str) -> No
         outputs = {"out": task(images)} if shapes else task(images)
         assert outputs["out"].shape == ((2, 40) if shapes else (2, 13, 32, 32))
     sum(output.square().mean() for output in outputs.values()).backward()
-    unused = [n for n, p in task.named_parameters() if p.grad is None and ".mixer." not in n]
+    unused = [n for n, p in task.named_parameters() if p.grad is None]
     assert not unused, "parameters without gradient"
 
 
