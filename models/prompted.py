@@ -85,10 +85,9 @@ class PromptedNetwork(nn.Module):
             tokenizer.enable_truncation(length)
             tokenizer.enable_padding(**(tokenizer.padding | {"length": length}))
             tokens = tokenizer.encode_batch([text for of in prompts.values() for text in of])
-            ids, mask = (
-                torch.tensor([getattr(of, name) for of in tokens]).to(self.tokenizer.device)
-                for name in ("ids", "attention_mask")
-            )
+            device = self.tokenizer.device
+            ids = torch.tensor([of.ids for of in tokens], device=device)
+            mask = torch.tensor([of.attention_mask for of in tokens], device=device)
             of_text = self.network if self._is_sam else self.network.clip
             returned = of_text.get_text_features(ids, attention_mask=mask)
             self.embeddings, self.is_token = returned.pooler_output, mask > 0

@@ -197,12 +197,8 @@ class LoadedNetwork(NetworkDescription):
         if prompts is None and threshold is None:
             return self
         if not isinstance(self.module, PromptedNetwork):
-            raise SettingError(
-                "checkpoint",
-                found="a network that takes no text",
-                expected="CLIPSeg or SAM 3, imported with prompts=",
-                remedy="Leave prompts= and threshold= out.",
-            )
+            found, expected = "a network without text", "CLIPSeg or SAM 3 of tangent-import"
+            raise SettingError("checkpoint, with prompts=", found=found, expected=expected)
         texts: Any = prompts
         settings = {**(self.settings or {}), **self.module.set_prompts(texts, threshold)}
         if texts is None:

@@ -262,8 +262,7 @@ class _Prediction:
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     """Return the names of the settings that are read besides those of the head."""
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
-    names |= {"prompts", "threshold"}
-    names |= {"levels", "base_level", "blend", "write", "report", "shard"}
+    names |= {"levels", "base_level", "blend", "write", "report", "shard", "prompts", "threshold"}
     names |= {"view_batch_size", "compile", "device", "trust"}
     panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
     if loaded.predicts == DISTANCE:

@@ -137,12 +137,11 @@ def load(
         network = build_from_file(settings, "network", path)
         _load_tensors(network, tensors_in(folder), folder)
     settings["config"] = architecture(network.network.config.to_dict())
-    given = None if normalization is None else Normalization.of(normalization, 3)
     return PhotoNetwork(
         module=network,
         settings=settings,
         score_names=given_names,
-        normalization=given or Normalization(processor["mean"], processor["std"]),
+        normalization=Normalization.of(normalization or processor["normalization"], 3),
         image_size=_image_size(processor, folder / "preprocessor_config.json"),
         score_kind="logits",
         depth_kind=kind,
@@ -185,12 +184,11 @@ def prompted(
         _load_tensors(network, tensors_in(folder), folder)
         network.tokenizer = torch.frombuffer(bytearray(encoded), dtype=torch.uint8)
         settings |= network.set_prompts(prompts, threshold)
-    given = None if normalization is None else Normalization.of(normalization, 3)
     return PhotoNetwork(
         module=network,
         settings=settings,
         score_names=(*names, UNKNOWN_NAME),
-        normalization=given or Normalization(processor["mean"], processor["std"]),
+        normalization=Normalization.of(normalization or processor["normalization"], 3),
         image_size=network.fixed_size,
         score_kind="logits",
         things=names if described["model_type"] == "sam3" else (),
@@ -240,7 +238,7 @@ def _predicts_depth(config: Mapping[str, Any], path: Path, depth: DepthKind | No
 def _processor(folder: Path, model_type: str) -> dict[str, Any]:
     """Return settings of the image processor, with the defaults of its class.
 
-    ``do_flip_channel_order``, ``mean`` and ``std`` (for images from 0 to 1) are measured. Settings
+    ``do_flip_channel_order`` and ``normalization`` (of images from 0 to 1) are measured. Settings
     with a text are left out, because some of them are names of files that would be fetched.
 
     Raises:
@@ -273,7 +271,7 @@ def _processor(folder: Path, model_type: str) -> dict[str, Any]:
     numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
     rounded = {n: [float(f"{value:.6g}") for value in values] for n, values in numbers.items()}
     settings: dict[str, Any] = processor.to_dict()
-    return settings | rounded | {"do_flip_channel_order": bool(order[0])}
+    return settings | {"normalization": rounded, "do_flip_channel_order": bool(order[0])}
 
 
 def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]] | None:

@@ -91,12 +91,12 @@ def load_torchvision(
     network = build_from_config(settings, "network")
     tensors = tensors_for(network, Path(weights)) if is_file else fetch_tensors(str(chosen))
     _load_used(network, tensors, weights)
-    default = Normalization(preset.mean, preset.std)
+    default = {"mean": preset.mean, "std": preset.std}
     return PhotoNetwork(
         module=network,
         settings=settings,
         score_names=names,
-        normalization=default if normalization is None else Normalization.of(normalization, 3),
+        normalization=Normalization.of(normalization or default, 3),
         image_size=(preset.resize_size[0], preset.resize_size[0]),
         score_kind="logits",
     )
@@ -112,7 +112,7 @@ def _mask_rcnn(
 ) -> PhotoNetwork:
     """Load Mask R-CNN, which normalizes images itself; `file` None loads the published weights."""
     labels = [k for k, name in enumerate(names) if k and name != _NO_CLASS]
-    colors = Normalization.of("imagenet" if normalization is None else normalization, 3)
+    colors = Normalization.of(normalization or "imagenet", 3)
     settings = {
         "_target_": "models.MaskRCNN",
         "model": model,
@@ -161,13 +161,12 @@ def load_smp(model: Any, classes: Path | None = None, normalization: Any = None)
         **dict.fromkeys(_LEFT_OUT & config.keys()),
     }
     network = build_from_file(settings, "network", path)
-    given = None if normalization is None else Normalization.of(normalization, 3)
     _load_used(network, tensors_in(folder), folder)
     return PhotoNetwork(
         module=network,
         settings=settings,
         score_names=class_names_in(classes),
-        normalization=given or _of_encoder(config),
+        normalization=Normalization.of(normalization or _of_encoder(config), 3),
         score_kind="logits",
     )
 

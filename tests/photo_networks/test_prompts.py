@@ -127,7 +127,7 @@ def test_texts_of_classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_networks_without_text_are_refused(tmp_path: Path) -> None:
     networks.saved(networks.segformer, tmp_path)
-    with pytest.raises(SettingError, match="takes no text"):
+    with pytest.raises(SettingError, match="a network without text"):
         networks.imported(tmp_path).prompted(prompts=["mast"])
     networks.tokenizer(tmp_path)
     with pytest.raises(SettingError, match="found 'segformer'; expected 'clipseg' or 'sam3'"):
