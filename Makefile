@@ -19,8 +19,9 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(None if (3, 11) <= sys.version_info < (3, 14) else "Python 3.11 to 3.13 is needed: make PYTHON=python3.12 …")'
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
-	@# The metadata of torch-harmonics 0.9.3 excludes torch 2.15, with which it works.
-	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps torch-harmonics
+	@# The metadata of torch-harmonics 0.9.3 excludes torch 2.15, with which it works; that of Depth Anything 3 NumPy 2.
+	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps \
+		torch-harmonics depth-anything-3 addict einops
 	@touch $@
 
 demo: install

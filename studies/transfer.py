@@ -8,7 +8,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from tangent_train.results.chart import COLORS
+from studies.output import COLORS
 
 DATA = Path(__file__).parents[1] / "docs" / "results" / "data"
 STAGES = {

@@ -36,7 +36,6 @@ from datamodules.core.label_map import (
 from datamodules.core.loading import EpochSampler, share_of_process, this_process
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, wrong_setting
-from tangent_train.manifest import Shard
 from tangent_train.progress import show_progress
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.threads import in_threads
@@ -356,17 +355,7 @@ class DataModule(LightningDataModule, ABC):
         return Cache(folder, {"data": type(self).__name__, **settings}, self.kind)
 
     def prepare_data(self) -> None:
-        """Generate the files and complete the cache."""
-        self.prepare(Shard())
-
-    def prepare(self, shard: Shard) -> int:
-        """Generate the files and complete a part of the cache, e.g. on one of several machines.
-
-        Args:
-            shard: Part of all items, which have the same order on every machine.
-
-        Returns:
-            Number of items of the part.
+        """Generate the files and complete the cache.
 
         Raises:
             DataError: A file is broken.
@@ -381,14 +370,11 @@ class DataModule(LightningDataModule, ABC):
                 expected="one or more",
                 remedy="Train on other data; these are for tangent-evaluate and tangent-transfer.",
             )
-        items = [(split, files) for split in SPLITS for files in splits[split]]
-        items = list(shard.part(items))
         if self.cache is not None:
-            missing = [item for item in items if not self._cache.path(item[1]).is_file()]
-            of_splits = {s: [files for split, files in missing if split == s] for s in SPLITS}
-            self._read_all(of_splits, f"Preparing {self.noun}")
+            path = self._cache.path
+            missing = {s: [f for f in of if not path(f).is_file()] for s, of in splits.items()}
+            self._read_all(missing, f"Preparing {self.noun}")
             self.problems.refuse(self.root, _REMEDY)
-        return len(items)
 
     def setup(self, stage: str | None = None) -> None:
         """Find and check the files once; other processes of the run take those of the first.

@@ -16,13 +16,7 @@ from datamodules.core.data_module import print_on_rank_zero
 from datamodules.core.files import ImageFiles
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PanoramaPose
-from tangent_train.io.gpano import (
-    PanoramaArea,
-    check_resolution,
-    read_area,
-    read_tags,
-    refuse_stereo,
-)
+from tangent_train.io.gpano import PanoramaArea, check_resolution, read_area
 from tangent_train.io.image_files import image_paths, short_names
 from tangent_train.io.pixel_files import read_rgb
 from tangent_train.rendering.resampling import resize
@@ -34,7 +28,6 @@ class PairedPanorama(NamedTuple):
     Attributes:
         name: Unique name; a panorama has the same name in every pair.
         rgb: ``(H, W, 3)`` uint8.
-        file: Image file.
         distance_m: ``(H, W)`` float32 meters from the center, NaN where missing; or None.
         pose: Camera pose; or None.
         valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
@@ -42,7 +35,6 @@ class PairedPanorama(NamedTuple):
 
     name: str
     rgb: NDArray[np.uint8]
-    file: Path
     distance_m: NDArray[np.float32] | None = None
     pose: PanoramaPose | None = None
     valid: NDArray[np.bool_] | None = None
@@ -118,11 +110,6 @@ class PanoramaPairs(ABC):
             raise SettingError("data", found=found, expected=expected)
         return [name for name, _, _ in self.pairs]
 
-    @property
-    def files(self) -> list[Path]:
-        """Image files of all panoramas, without duplicates."""
-        return list(dict.fromkeys(side.rgb for _, *both in self.pairs for side in both))
-
     def read(self, index: int) -> PanoramaPair:
         """Read a pair.
 
@@ -181,7 +168,6 @@ class ImagePairs(PanoramaPairs):
     def panorama(self, files: ImageFiles) -> PairedPanorama:
         """See `PanoramaPairs`; a partial panorama repeats its edges elsewhere."""
         rgb = read_rgb(files.rgb)
-        refuse_stereo(files.rgb, read_tags(files.rgb))
         area = read_area(files.rgb, (rgb.shape[0], rgb.shape[1]))
         whole = area.filled(area.place(rgb), "edge")
-        return PairedPanorama(files.name, whole, files.rgb, valid=area.valid)
+        return PairedPanorama(files.name, whole, valid=area.valid)

@@ -51,9 +51,22 @@ def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
         SettingError: ``classes.json`` lacks one of the classes.
     """
     classes = read_label_map(folder / "classes.json")
-    names, ignored = classes.names, list(map(image_files.composed, ignored))
-    if set(ignored) - set(names):
-        found = ", ".join(sorted(set(ignored) - set(names)))
-        raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")
-    labels = [names.index(name) + 1 for name in ignored]
+    labels = ignored_labels(classes.names, ignored)
     return Masks(folder / "labels", counts=lambda path: ~np.isin(classes.read_labels(path), labels))
+
+
+def ignored_labels(names: Sequence[str], ignored: Sequence[str] | None) -> list[int]:
+    """Return the labels of the classes to ignore.
+
+    Args:
+        names: Names of labels 1 to K.
+        ignored: Names of the classes.
+
+    Raises:
+        SettingError: There is no such class, or none is given.
+    """
+    chosen = list(map(image_files.composed, ignored or ()))
+    if not chosen or set(chosen) - set(names):
+        found = ", ".join(sorted(set(chosen) - set(names))) or "null"
+        raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")
+    return [names.index(name) + 1 for name in chosen]

@@ -114,7 +114,7 @@ class StanfordPairs(PanoramaPairs):
         depth_m = resize_depth(read_depth_m(path, STEPS_PER_M), rgb.shape[:2])
         depth_m[depth_m == 0] = np.nan
         pose = read_panorama_pose(sibling(files.rgb, "pose.json"))
-        return PairedPanorama(files.name, rgb, files.rgb, depth_m, pose)
+        return PairedPanorama(files.name, rgb, depth_m, pose)
 
 
 def _camera(files: ImageFiles) -> str:

@@ -167,4 +167,4 @@ class ZindPairs(PanoramaPairs):
         rgb = read_whole(files.rgb, self.erp_height)
         pose, unit_m = files.pose()
         distance_m = (files.layout().distances(rgb.shape[:2]) * unit_m).astype(np.float32)
-        return PairedPanorama(files.name, rgb, files.rgb, distance_m, pose)
+        return PairedPanorama(files.name, rgb, distance_m, pose)

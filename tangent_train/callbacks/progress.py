@@ -27,14 +27,11 @@ class ProgressBar(RichProgressBar):
         self._lines = PlainLines()
         self._begun = 0.0
         self._epochs = 0
-        self._validated = 0  # epoch of the last validation
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
-        """Return the metrics that are printed after the bar; older scores name their epoch."""
+        """Return the metrics that are printed after the bar."""
         metrics = super().get_metrics(trainer, pl_module)
-        old = f" (epoch {self._validated})" * (self._validated <= trainer.current_epoch)
-        ends = {name: old if name.startswith("val/") else "" for name in metrics if name != "v_num"}
-        return {name + end: metrics[name] for name, end in ends.items()}
+        return {name: value for name, value in metrics.items() if name != "v_num"}
 
     def on_train_start(self, *args: Any) -> None:
         """Start to time the epochs."""
@@ -50,11 +47,6 @@ class ProgressBar(RichProgressBar):
         """Print a line per minute."""
         super().on_validation_batch_end(trainer, *args)
         self._print("Validation", args[3], trainer.num_val_batches[0])
-
-    def on_validation_end(self, trainer: Trainer, *args: Any) -> None:
-        """Note the epoch."""
-        super().on_validation_end(trainer, *args)
-        self._validated = trainer.current_epoch + 1
 
     def on_test_batch_end(self, trainer: Any, *args: Any) -> None:
         """Print a line per minute."""

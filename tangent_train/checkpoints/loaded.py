@@ -23,9 +23,9 @@ from models.onnx_network import OnnxNetwork
 from models.pretrained import load_tensors
 from models.prompted import PromptedNetwork
 from tangent_train.checkpoints.outputs import OutputNetwork
-from tangent_train.config.build import checks_types, filled
+from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
-from tangent_train.config.settings import Prompts, Threshold
+from tangent_train.config.settings import Prompts, texts_of_classes
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
 from tangent_train.files import checked_file, load_plain
 from tangent_train.geometry.camera import half_width
@@ -180,9 +180,8 @@ class LoadedNetwork(NetworkDescription):
         count = len(self.class_names) - 1
         return OutputNetwork(self.module, count, self.groups, tile, self.score_kind).eval()
 
-    @checks_types
     def prompted(
-        self, *, prompts: Prompts | None = None, threshold: Threshold | None = None
+        self, prompts: Prompts | None = None, threshold: float | None = None
     ) -> LoadedNetwork:
         """Return the network with other texts as classes; its `module` is changed.
 
@@ -199,7 +198,7 @@ class LoadedNetwork(NetworkDescription):
         if not isinstance(self.module, PromptedNetwork):
             found, expected = "a network without text", "CLIPSeg or SAM 3 of tangent-import"
             raise SettingError("checkpoint, with prompts=", found=found, expected=expected)
-        texts: Any = prompts
+        texts = None if prompts is None else texts_of_classes(prompts)
         settings = {**(self.settings or {}), **self.module.set_prompts(texts, threshold)}
         if texts is None:
             return replace(self, settings=settings)

@@ -5,17 +5,12 @@ from __future__ import annotations
 import sys
 from contextlib import redirect_stdout
 
-import numpy as np
-
 from datamodules.core.label_map import label_doubts
-from tangent_train.cli import main
 from tangent_train.cli.run import open_data
 from tangent_train.cli.scored_files import check_files
 from tangent_train.config.settings import FilesSettings
 from tangent_train.console import print_text
 from tangent_train.errors import counted
-from tangent_train.geometry import equirect_solid_angles
-from tangent_train.io.pixel_files import has_warned_of_range
 from tangent_train.results.tables import Table, percent
 
 
@@ -50,7 +45,6 @@ def check(settings: FilesSettings) -> None:
         for split, counts in labeled.items()
         for doubt in label_doubts(split, counts, data.label_names)
     ]
-    warnings += ["16-bit colors of few bits, which are named above"] * has_warned_of_range()
     with redirect_stdout(sys.stdout if terminal else sys.stderr):
         if labeled:
             shares = [[percent(share) for share in n / n.sum()] for n in labeled.values()]
@@ -59,25 +53,9 @@ def check(settings: FilesSettings) -> None:
             Table(f"Pixels of each {kind}, %", [kind, *labeled], rows).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
-    if getattr(data, "area", None) is not None:
-        valid = data.canvas.valid
-        views = [sum(map(len, data.representation.view_sets(v))) for v in (valid, None)]
-        rows, columns = data.representation.image_size
-        angles = equirect_solid_angles(data.canvas.full_shape)
-        share = 1.0 if valid is None else np.average(valid.mean(axis=1), weights=angles)
-        area = ", ".join(f"{angle:g}" for angle in data.area)
-        print_text(
-            f"Area [{area}]: {percent(share)} % of the sphere; "
-            f"{views[0]} of {views[1]} views, {columns} × {rows} pixels each.",
-            error=not terminal,
-        )
     summary = counted(len(listed), "problems") if listed else "Nothing is wrong"
     if warnings:
         summary = f"{counted(len(listed), 'problems')} and {counted(len(warnings), 'warnings')}"
     print_text(f"{summary}; {checked}.", error=bool(listed or warnings) and not terminal)
     if listed:
         sys.exit(1)
-
-
-if __name__ == "__main__":
-    main.check()

@@ -14,9 +14,8 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from datamodules.core.label_map import PANOPTIC
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
-from tangent_train.cli.scored_files import OF_FILES, score_files
+from tangent_train.cli.scored_files import score_files
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import EvaluateSettings, refuse_typed
 from tangent_train.errors import SettingError, check_choice, listed
@@ -40,15 +39,11 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.predictions is not None:
         score_files(settings, folder)
         return
-    refuse_typed(OF_FILES, "nothing: it is read with predictions=")
     if settings.input is not None:
         refuse_typed(("data", "experiment", "panels"), "nothing: input= has no labels")
-    checkpoint = settings.checkpoint
-    if checkpoint is None:
-        expected = "a network, or predictions=<folder>"
-        raise SettingError("checkpoint", found="null", expected=expected)
+    checkpoint: Any = settings.checkpoint
     loaded = load_network(checkpoint, settings.trust)
-    loaded = loaded.prompted(prompts=settings.prompts, threshold=settings.threshold)
+    loaded = loaded.prompted(settings.prompts, settings.threshold)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])
     loaded.check_predicts(head.kind, remedy)
@@ -136,7 +131,3 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
         data = {**data, "inputs": list(loaded.inputs), "normalization": normalization}
     network = loaded.settings
     return {"level": level, "representation": section, "data": data, "network": network}
-
-
-if __name__ == "__main__":
-    main.evaluate()

@@ -9,32 +9,15 @@ from typing import TYPE_CHECKING
 from rich import get_console
 from rich.text import Text
 
-from tangent_train.cli import main
 from tangent_train.config.settings import ImportSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, listed, printable, width_height
 from tangent_train.files import check_new
-from tangent_train.kinds import DepthKind, ScoreKind
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.photo_networks import PhotoNetwork
 
-
-_OUTPUTS: dict[ScoreKind | DepthKind, str] = {
-    "logits": "scores before a softmax",
-    "probabilities": "probabilities after a softmax",
-    "labels": "label maps, of which other values are unknown",
-    "log_distance": "the logarithm of the distance in meters",
-    "metric_distance": "the distance along each ray in meters",
-    "metric_z": "z-depth in meters",
-    "canonical_z": "z-depth in meters of one camera; that of a view follows its focal length",
-    "canonical_inverse": "1 / z-depth in meters, times the focal length of a view in widths",
-    "relative_z": "z-depth up to a scale of each view",
-    "relative_depth": "z-depth up to a scale and a shift of each view",
-    "relative_disparity": "1 / z-depth up to a scale and a shift of each view",
-    "relative_points": "points up to a scale and a shift along z of each view",
-}
 
 _OF_CLASSES = {"unknown_classes", "unknown_wins", "scores"}
 """Settings that only networks of classes have."""
@@ -127,10 +110,10 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
     return "\n".join(
         [
             f"{path}: {path.stat().st_size / 1e6:.1f} MB",
-            f"{len(names)} classes: {listed(names)}" if kind is None else f"depth: {kind}",
+            *[f"{len(names)} classes: {listed(names)}"] * (kind is None),
             *[f"objects of: {listed(trained.things)}"] * bool(trained.things),
             *[unknown] * bool(settings.unknown_classes),
-            f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
+            f"the network returns {kind or trained.score_kind}",
             f"normalization of images from 0 to 1: mean {mean}, std {std}",
             f"image size: {size}{multiple}",
             f"photos of its training: {_camera(trained)}",
@@ -138,7 +121,3 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
             *[trust] * bool(trained.trust),
         ]
     )
-
-
-if __name__ == "__main__":
-    main.import_network()

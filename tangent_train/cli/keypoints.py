@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import re
 import sys
-from collections.abc import Sequence
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 from rich.progress import track
 
-from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
-from tangent_train.cli import main
+from datamodules.core.panorama_pairs import ImagePairs, PanoramaPairs
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import KeypointSettings
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, width_height
+from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_bytes
-from tangent_train.io.pixel_files import read_image_size
-from tangent_train.keypoints.colmap import add_pair
-from tangent_train.keypoints.compare import AS_GIVEN, Comparer, Comparison
+from tangent_train.keypoints.compare import Comparer
 from tangent_train.keypoints.report import matches_png, write_report
 from tangent_train.keypoints.two_view import colmap
 from tangent_train.manifest import Manifest
@@ -38,7 +32,7 @@ def keypoints(settings: KeypointSettings) -> None:
     of_comparer = {field.name: getattr(settings, field.name) for field in fields(Comparer)}
     comparer, output = Comparer(**of_comparer), settings.output
     data, pairs = _pairs(settings)
-    content = {**of_comparer, "export": settings.export, "data": data}
+    content = {**of_comparer, "data": data}
     manifest = Manifest.open(output, content)
     pairs.make_files()
     names, finished = pairs.names[: settings.max_pairs], manifest.finished
@@ -47,10 +41,7 @@ def keypoints(settings: KeypointSettings) -> None:
     for name in track(missing, "Comparing pairs", disable=not missing):
         index = names.index(name)
         try:
-            pair = pairs.read(index)
-            comparison = comparer.compare(pair)
-            if settings.export:
-                _export(output / "export", pairs.files, pair, comparison)
+            comparison = comparer.compare(pairs.read(index))
         except (DataError, MemoryError) as error:  # a SettingError would concern all pairs
             print_text(f"Pair {name}: {error or 'not enough memory'}")
             continue
@@ -63,8 +54,6 @@ def keypoints(settings: KeypointSettings) -> None:
         for table in write_report(output, rows, content, pairs.published):
             table.print()
     print_text(f"Results are in {output}." if rows else "There are no results.")
-    if settings.export:
-        print_text(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
     if failed := manifest.missing(names):
         sys.exit(f"tangent-keypoints: {len(failed)} of {len(names)} pairs failed, see above")
 
@@ -86,32 +75,6 @@ def _pairs(settings: KeypointSettings) -> tuple[Any, PanoramaPairs]:
     return settings.data, pairs
 
 
-def _export(
-    folder: Path, files: Sequence[Path], pair: PanoramaPair, comparison: Comparison
-) -> None:
-    """Add the unrotated pair to the database of every representation.
-
-    Raises:
-        DataError: A file shows only a part of the sphere.
-    """
-    images = []
-    for file in (pair.left.file, pair.right.file):
-        shape = read_image_size(file)
-        if abs(shape[1] - 2 * shape[0]) > 1:
-            found = f"{width_height(shape)}, a part of a panorama"
-            raise DataError(file, found=found, expected="a whole panorama for COLMAP")
-        images.append((file.absolute().relative_to(_root(files)).as_posix(), shape))
-    for name, matched in comparison.matched[AS_GIVEN].items():
-        path = folder / file_name(name) / "database.db"
-        sides = (matched.left, matched.right)
-        add_pair(path, images, sides, matched.matches, matched.geometry)
-
-
-def _root(files: Sequence[Path]) -> Path:
-    """Return the innermost folder that contains all images."""
-    return Path(os.path.commonpath([file.absolute().parent for file in files]))
-
-
 def file_name(name: str) -> str:
     """Replace characters of a name that do not belong in a file name; at most 80 are kept.
 
@@ -119,7 +82,3 @@ def file_name(name: str) -> str:
     'hall_a_hall_b'
     """
     return re.sub(r"[^\w.-]+", "_", name).strip("_.")[:80] or "pair"
-
-
-if __name__ == "__main__":
-    main.keypoints()

@@ -6,7 +6,7 @@ import hashlib
 import math
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -15,23 +15,20 @@ import numpy as np
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.folder.class_masks import mask_reader
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.cli import main
 from tangent_train.cli.one_scale import OneScale
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted, listed
+from tangent_train.errors import SettingError, counted, listed
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
 from tangent_train.inference import images
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.engine import Predictor, UpLikelihood
+from tangent_train.inference.mask_network import MaskNetwork, is_network
 from tangent_train.inference.views import ViewSelector
 from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
-
-_COUNTED_IMAGES = 32
-"""Images whose confidences are counted for `min_share`, at most."""
 
 
 def predict(settings: PredictSettings) -> None:
@@ -42,7 +39,7 @@ def predict(settings: PredictSettings) -> None:
         DataError: The checkpoint cannot be read, or no images are found.
     """
     shard = Shard.parse(settings.shard)
-    inputs = Inputs.find(settings.input, settings.every, settings.eye, settings.area)
+    inputs = Inputs.find(settings.input, settings.every)
     prediction = _Prediction(settings)
     folder, names = prediction.folder, inputs.names
     content = settings.model_dump(mode="json", exclude={*settings.not_content})
@@ -55,8 +52,6 @@ def predict(settings: PredictSettings) -> None:
     missing = manifest.missing(shard.part(names))
     done = len(shard.part(names)) - len(missing)
     print_text(f"{counted(len(missing) + done, 'images')}, {done} done already.")
-    if missing:
-        prediction.count(inputs)
     prediction.shown = {names[k] for k in evenly_spread(settings.report, len(names))}
     errors = _work("Predicting", inputs, missing, manifest, prediction.predict, prediction)
     manifest = Manifest.open(settings.output, same)  # with what other shards have finished
@@ -67,7 +62,7 @@ def predict(settings: PredictSettings) -> None:
         finished = [name for name in names if name not in left]
         if second := prediction.one_scale:
             second.fit({name: manifest.finished[name][folder.head.summary] for name in finished})
-            errors |= _work("Scaling", inputs, finished, manifest, second.scaled, prediction)
+            errors |= _work("Scaling", inputs, finished, manifest, prediction.scaled, prediction)
         errors |= _write_videos(inputs, folder, manifest)
         entries = [{"name": n, **manifest.finished.get(n, errors.get(n, {}))} for n in names]
         folder.write_summary(content, entries)
@@ -132,7 +127,7 @@ class _Prediction:
 
     def __init__(self, settings: PredictSettings) -> None:
         original = loaded = load_network(settings.checkpoint, settings.trust).prompted(
-            prompts=settings.prompts, threshold=settings.threshold
+            settings.prompts, settings.threshold
         )
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
@@ -164,7 +159,10 @@ class _Prediction:
         if settings.upright == "auto":
             loaded.check_predicts(PIXEL_CLASSES, "Use upright=pose, or null.")
         self._settings, self._head = settings, head
-        self._masks = mask_reader(settings.mask, settings.mask_classes)
+        networks = [mask for mask in settings.mask or () if is_network(mask)]
+        files = [mask for mask in settings.mask or () if mask not in networks]
+        self._masks = mask_reader(files, settings.mask_classes)
+        self._mask_networks = [MaskNetwork(file, settings) for file in networks]
         on_device = settings.device, settings.view_batch_size, settings.compile
         self._predictor = Predictor(loaded, head, views, *on_device)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
@@ -176,20 +174,6 @@ class _Prediction:
             of_file = settings.depth_scale, settings.depth_channel
             self._depth = images.DepthFolder(settings.depth, *of_file)
 
-    def count(self, inputs: Inputs) -> None:
-        """Let the head count in some of the images, see `Head.count`."""
-        names = inputs.names
-        chosen = [names[k] for k in evenly_spread(_COUNTED_IMAGES, len(names))]
-
-        def mosaics() -> Iterator[Any]:
-            for job in inputs.jobs(chosen):
-                with suppress(DataError, SettingError):  # reported when the image is predicted
-                    if not job.error:
-                        yield self._predictor.predict(self._upright(self.read(job)), averaged=True)
-
-        if line := self._head.count(mosaics()):
-            print_text(line)
-
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""
         settings, image = self._settings, job.value or job.path
@@ -197,7 +181,7 @@ class _Prediction:
         depth = None if self._depth is None else partial(self._depth.read, stem)
         if settings.projection == "perspective":
             return images.read_photo(image, settings.fov, depth)
-        return images.read_panorama(image, settings.area, settings.upright, depth, settings.eye)
+        return images.read_panorama(image, settings.area, settings.upright, depth)
 
     def _upright(self, image: images.InputImage) -> images.InputImage:
         if self._settings.upright != "auto":
@@ -217,16 +201,25 @@ class _Prediction:
         def result() -> tuple[Any, Any]:
             return mosaic.pixels(), mosaic.facts
 
-        return image, result if self._head.waits else result()
+        return image, result if self._head.waits else result(), self._unmasked(image)
+
+    def scaled(self, job: Job, progress: Callable[[float], object]) -> tuple[Any, ...]:
+        """Return an image at its scale, as `predict` does."""
+        one_scale: Any = self.one_scale
+        return *one_scale.scaled(job, progress), self._unmasked(job.value)
+
+    def _unmasked(self, image: images.InputImage) -> Any:
+        """Return True where the networks of `mask` leave the pixels of an image."""
+        return np.logical_and.reduce([network(image) for network in self._mask_networks])
 
     def write(self, job: Job) -> dict[str, Any]:
         """Write the results of one image; return its entry in the summary."""
-        image, result = job.value
+        image, result, unmasked = job.value
         predicted = PredictedImage.fetch(image, *(result() if callable(result) else result))
         _, pixels, facts = predicted
         is_counted = np.array(True)
         if image.area is not None:
-            is_counted = image.cut(self._masks(job.name, image.area)) > 0
+            is_counted = image.cut((self._masks(job.name, image.area) > 0) & unmasked)
             unknown = pixels.dtype.type(self._head.unknown)
             predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
         if self.one_scale and not self.one_scale.facts:
@@ -238,8 +231,6 @@ class _Prediction:
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         entry |= job.place
-        if self._settings.eye:
-            entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
         return entry | self._head.entry(predicted, is_counted)
@@ -264,7 +255,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
     names |= {"levels", "base_level", "blend", "write", "report", "shard", "prompts", "threshold"}
     names |= {"view_batch_size", "compile", "device", "trust"}
-    panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
+    panoramas = {"area", "fill", "views", "upright", "mask", "rotations"}
     if loaded.predicts == DISTANCE:
         panoramas |= {"align_across"}
     panoramas |= {"mask_classes"} if settings.mask is not None else set()
@@ -274,7 +265,3 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     return names | (
         {"depth", "depth_scale", "depth_channel"} if "depth" in loaded.inputs else set()
     )
-
-
-if __name__ == "__main__":
-    main.predict()

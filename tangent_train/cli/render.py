@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from datamodules.folder.class_masks import mask_reader
-from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
@@ -22,7 +21,6 @@ from tangent_train.files import check_new
 from tangent_train.geometry import (
     PanoramaPose,
     PinholeGrid,
-    TangentGrid,
     nearest_level,
     perspective_grid,
     to_right_handed,
@@ -40,11 +38,11 @@ from tangent_train.io.camera_files import (
     write_poses,
     write_rig,
 )
-from tangent_train.io.gpano import eye_part, read_area, read_tags, shape_of
+from tangent_train.io.gpano import read_area, read_tags
 from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.io.nerfstudio import write_transforms, write_z_depth
-from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_depth_m, read_image_size, write_pixels
+from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_depth_m, read_image_size
 from tangent_train.io.tangent_folders import (
     TangentResults,
     face_name,
@@ -56,7 +54,6 @@ from tangent_train.io.tangent_folders import (
 from tangent_train.io.videos import read_video_tags
 from tangent_train.keypoints.colmap import model_points, poses_from
 from tangent_train.manifest import Manifest
-from tangent_train.rendering.figure import tangent_figure
 from tangent_train.rendering.representations.pinhole import ring_size
 from tangent_train.rendering.resampling import resize
 
@@ -70,23 +67,21 @@ def render(settings: RenderSettings) -> None:
     """
     modes = [name for name in _MODES if getattr(settings, name) is not None]
     modes = ["input"] if settings.nerfstudio else modes
-    if len(modes) != 1 or (settings.output or settings.figure) is None:
+    if len(modes) != 1:
         found = " and ".join(modes) or "none of them"
-        expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>, and output="
+        expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>"
         remedy = "Example: tangent-render input=panoramas output=tangent"
         raise SettingError("input, back and poses", found=found, expected=expected, remedy=remedy)
     run, read = _MODES[modes[0]]
+    read = read | (_OF_PROJECTS if settings.colmap or settings.nerfstudio else set())
+    read |= _OF_NERFSTUDIO if settings.nerfstudio else set()
     check_read(settings, {*read, *modes, "output", "overwrite"})
     run(settings, settings.model_dump(mode="json", exclude={*settings.not_content}))
 
 
 def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     """Render panoramas to folders of tangent images, or to one project for COLMAP."""
-    inputs = Inputs.find(settings.input or "", settings.every, settings.eye, settings.area)
-    if settings.figure is not None:
-        _write_figure(settings, inputs, settings.figure)
-    if settings.output is None:
-        return
+    inputs = Inputs.find(settings.input or "", settings.every)
     output, kind, suffix = settings.output, settings.interpolation, f".{settings.format}"
     if kind == "nearest" and suffix in LOSSY_SUFFIXES:
         expected = "png, tif or npy with interpolation=nearest: other formats change pixels"
@@ -105,7 +100,7 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     manifest = Manifest.open(output, content)
 
     def work(job: Job, progress: Callable[[float], object]) -> None:
-        source = job.path, kind, settings.area, job.value, settings.depth_channel, settings.eye
+        source = job.path, kind, settings.area, job.value, settings.depth_channel
         image, area = read_placed(*source)
         shape = image.shape[0], image.shape[1]
         if is_project:
@@ -180,19 +175,6 @@ def _print_written(output: Path, names: Sequence[str], failed: int) -> None:
         sys.exit(f"tangent-render: {text}")
 
 
-def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
-    """Write the figure of the first panorama."""
-    check_new(path, overwrite=settings.overwrite)
-    job = next(iter(inputs.jobs(inputs.names)))
-    kind, channel = settings.interpolation, settings.depth_channel
-    image, _ = read_placed(job.path, kind, settings.area, job.value, channel, settings.eye)
-    grid = _cameras(settings, image.shape[0]).grid
-    if not isinstance(grid, TangentGrid):
-        raise SettingError("figure", found=path, expected="null: only tangent images have a figure")
-    write_pixels(path, tangent_figure(image, grid))
-    print_text(f"Written: {path}")
-
-
 def _cameras(settings: RenderSettings, rows: int) -> CameraFile:
     """Return the images to write of a panorama with some rows; source and shape are not set."""
     grids = _grids(settings, _level(settings, rows))
@@ -251,15 +233,13 @@ def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
         with suppress(DataError, SettingError):
             tags = read_video_tags(path) if path in sizes else read_tags(path)
             size = sizes.get(path) or read_image_size(path)
-            if path not in sizes:
-                size = shape_of(size, eye_part(path, size, settings.eye, area, tags))
             rows.append(read_area(path, size, area, tags=tags).full_shape[0])
     return max(rows, default=512)
 
 
 def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
     """Write the poses of the panoramas from a model of COLMAP."""
-    model, output = settings.poses or Path(), settings.output or Path()
+    model, output = settings.poses or Path(), settings.output
     check_new(output, overwrite=settings.overwrite)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
     poses = poses_from(model, settings.cameras)
@@ -270,7 +250,7 @@ def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
 
 def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     """Render the results of one panorama to a file, or those of a folder of panoramas."""
-    back, output = settings.back or Path(), settings.output or Path()
+    back, output = settings.back or Path(), settings.output
     root = settings.cameras or back
 
     def write(folder: Path, cameras_file: Path, path: Path, *, adds_suffix: bool = False) -> None:
@@ -314,17 +294,17 @@ _DIRECTIONS = ("yaw", "pitch", "roll", "fov", "size")
 _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set[str]]] = {
     "input": (
         _render_views,
-        {"every", "area", "eye", "views", "base_level", "level", "dim", "faces", "rotation"}
+        {"every", "area", "views", "base_level", "level", "dim", "faces", "rotation"}
         | {*_DIRECTIONS, "format"}
-        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "depth_channel"}
-        | {"nerfstudio", "poses", "cameras", "depth", "depth_scale"},
+        | {"interpolation", "colmap", "nerfstudio", "depth_channel"},
     ),
     "back": (_render_back, {"cameras", "blend", "height", "kind", "depth_channel", "z_depth"}),
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
 
-_SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
+_OF_PROJECTS = {"mask", "mask_classes"}
+_OF_NERFSTUDIO = {"poses", "cameras", "depth", "depth_scale"}
+"""Settings that are read with colmap=true or nerfstudio=true, and with the latter only."""
 
-if __name__ == "__main__":
-    main.render()
+_SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"

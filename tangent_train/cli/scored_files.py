@@ -34,9 +34,6 @@ from tangent_train.rendering.resampling import resize
 from tangent_train.results.tables import Table, percent, score_text
 from tangent_train.threads import in_threads
 
-OF_FILES = ("values", "files", "resample", "depth_scale", "depth_channel")
-"""Settings that are read with `predictions` only."""
-
 _OF_NETWORKS = (
     *("checkpoint", "trust", "label_map", "unmapped", "level", "trainer", "logger"),
     *("representation(?!.erp_height)", "data.inputs", "data.normalization"),

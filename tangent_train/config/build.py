@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial, wraps
+from functools import partial
 from inspect import signature
-from typing import Any, ParamSpec, TypeVar, get_type_hints
+from typing import Any, get_type_hints
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -18,23 +18,9 @@ from typing_extensions import TypedDict
 
 from tangent_train.errors import DataError, SettingError, wrong_setting
 
-_Arguments = ParamSpec("_Arguments")
-_Result = TypeVar("_Result")
-
 _CHECKED = ("lightning.", "torch.optim.", "tangent_train.tasks.")
 """Modules whose annotations are checked, and whose errors are explained: those of trainers,
 optimizers, schedules and tasks. Errors of other classes may be those of the user's own code."""
-
-
-class _ExplainedPartial(partial[Any]):
-    """A function whose errors name its section."""
-
-    place = target = ""
-
-    def __call__(self, *values: Any, **named: Any) -> Any:
-        """Call the function."""
-        with _explained(self.place, self.target):
-            return super().__call__(*values, **named)
 
 
 def build_from_config(section: Any, place: str, **given: Any) -> Any:
@@ -58,8 +44,7 @@ def build_from_config(section: Any, place: str, **given: Any) -> Any:
         make = instantiate({"_convert_": "all", **section, "_partial_": True})
         if target.startswith(_CHECKED):
             check_types(make.func, make.keywords, f"{place}.")
-        make = _ExplainedPartial(make.func, *make.args, **make.keywords | given)
-        make.place, make.target = place, target
+        make = partial(make.func, *make.args, **make.keywords | given)
         is_partial = section.get("_partial_") is True
         if is_partial:  # other arguments are refused now, not when it is called
             signature(make.func).bind_partial(*make.args, **make.keywords)
@@ -82,10 +67,8 @@ def _explained(place: str, target: str) -> Iterator[None]:
         raise SettingError(place, found=found, expected="settings that it accepts") from error
 
 
-def check_types(
-    function: Callable[..., Any], values: Mapping[str, Any], prefix: str = ""
-) -> dict[str, Any]:
-    """Return arguments as the types that a function declares, other than None.
+def check_types(function: Callable[..., Any], values: Mapping[str, Any], prefix: str) -> None:
+    """Check arguments, other than None, by the types that a function declares.
 
     Args:
         function: Function or class.
@@ -101,27 +84,15 @@ def check_types(
             called.__init__ if isinstance(function, type) else called, include_extras=True
         )
     except NameError:  # names that are imported for type checkers only
-        return {**values}
+        return
     kinds = {name: hints[name] for name, v in values.items() if name in hints and v is not None}
     make: Any = TypedDict
     arguments = make("arguments", kinds)
     arguments.__pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
     try:
-        typed = TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
+        TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
     except ValidationError as error:
         raise wrong_setting(error, prefix=prefix) from error
-    return {**values, **typed}
-
-
-def checks_types(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Decorate a function whose arguments by name are checked with `check_types`."""
-
-    @wraps(function)
-    def checked(*values: _Arguments.args, **named: _Arguments.kwargs) -> _Result:
-        typed: Any = check_types(function, named)
-        return function(*values, **typed)
-
-    return checked
 
 
 def filled(section: Any, known: Mapping[str, Any]) -> Any:

@@ -46,7 +46,7 @@ OneOrMore = Annotated[tuple[_Item, ...], BeforeValidator(_as_list)]
 """A list; a single value is a list of it."""
 
 
-def _texts_of_classes(value: Any) -> Any:
+def texts_of_classes(value: Any) -> dict[str, Sequence[str]]:
     """Return the texts of each class by its name; texts of a list or a .txt file are classes."""
     if not isinstance(value, Mapping):
         texts = [*map(str, _as_list(value))]
@@ -59,8 +59,8 @@ def _texts_of_classes(value: Any) -> Any:
     return {name: _as_list(texts) for name, texts in value.items()}
 
 
-Prompts = Annotated[Mapping[str, Sequence[str]] | Sequence[str], BeforeValidator(_texts_of_classes)]
-"""Texts of each class by its name, see `_texts_of_classes`."""
+Prompts = Annotated[Mapping[str, Sequence[str]] | Sequence[str], BeforeValidator(texts_of_classes)]
+"""Texts of each class by its name, see `texts_of_classes`."""
 
 Level = Annotated[int, Field(ge=0, le=14)]
 Rows = Annotated[int, Field(gt=0, le=2**15)]
@@ -132,9 +132,6 @@ class ImageSettings(Settings):
     area: tuple[float, float, float, float] | None = None
     """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
     sphere"""
-    eye: Literal["left", "right"] | None = None
-    """stereo panoramas (two pictures above or beside each other): left | right; null = not
-    stereo"""
 
 
 class PredictSettings(PromptSettings, ImageSettings, NetworkSettings):
@@ -199,13 +196,10 @@ class PredictSettings(PromptSettings, ImageSettings, NetworkSettings):
     """panoramas: pixels that become unknown (0): below a latitude (-60), black in a PNG file, or in
     a folder of one file per panorama; also several, e.g. [-60,tripod.png]; null = none"""
     mask_classes: OneOrMore[str] | None = None
-    """classes that become unknown, e.g. [sky], with mask= a folder that tangent-predict wrote
-    (labels/, classes.json); null = none"""
+    """classes that become unknown, e.g. [sky], with mask= the file of a network that predicts them,
+    or a folder that tangent-predict wrote (labels/, classes.json); null = none"""
     min_confidence: Share = 0
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
-    min_share: Share = 0
-    """keep at least this share of each class's pixels, the most confident ones, even below
-    min_confidence; measured on up to 32 images"""
     depth_format: Literal["png", "npy", "exr"] | None = None
     """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
     points: PositiveInt | None = None
@@ -228,7 +222,7 @@ class PredictSettings(PromptSettings, ImageSettings, NetworkSettings):
 class RenderSettings(ImageSettings):
     """Settings of tangent-render."""
 
-    not_content = ("figure", "output", "overwrite")
+    not_content = ("output", "overwrite")
 
     # --- input ---
     input: str | Path | None = None
@@ -269,14 +263,12 @@ class RenderSettings(ImageSettings):
     """single views: [width, height] in pixels, or one number; null = by level and fov"""
 
     # --- output ---
-    output: Path | None = None
+    output: Path
     """folder for the tangent images; with back=, the file of the panorama"""
     overwrite: bool = False
-    """true: replace an existing file of figure=, poses=, or back= with one panorama"""
+    """true: replace an existing file of poses=, or back= with one panorama"""
     format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
-    figure: Path | None = None
-    """PNG file of the first panorama and its tangent images; output is then optional"""
 
     # --- COLMAP ---
     colmap: bool = False
@@ -456,8 +448,6 @@ class KeypointSettings(Settings):
     """folder for the results; the same settings continue interrupted ones"""
     pictures: NonNegativeInt = 2
     """number of pairs whose matches are drawn"""
-    export: bool = False
-    """true: write keypoints and matches as COLMAP databases"""
 
 
 class RunSettings(Settings):
@@ -546,6 +536,14 @@ class FilesSettings(RunSettings):
     depth_channel: str | None = None
     """predictions: channel of OpenEXR files; null = as tangent-predict"""
 
+    @model_validator(mode="after")
+    def _check_predictions(self) -> Self:
+        """Refuse settings that are read with predictions only."""
+        if self.predictions is None:
+            of_files = {"values", "files", "resample", "depth_scale", "depth_channel"}
+            check_read(self, type(self).model_fields.keys() - of_files)
+        return self
+
 
 class EvaluateSettings(PromptSettings, NetworkSettings, FilesSettings):
     """Settings of tangent-evaluate."""
@@ -578,13 +576,13 @@ class EvaluateSettings(PromptSettings, NetworkSettings, FilesSettings):
     level: Level | None = None  # type: ignore[assignment]
     """level s, the angular resolution; null = as in the checkpoint"""
 
-
-class PrepareSettings(RunSettings):
-    """Settings of tangent-prepare."""
-
-    # --- performance ---
-    shard: str | int | None = None
-    """part of the cache for this process, e.g. 3/16; null = all"""
+    @model_validator(mode="after")
+    def _check_network(self) -> Self:
+        """Refuse an evaluation of nothing."""
+        if self.checkpoint is None and self.predictions is None:
+            expected = "a network, or predictions=<folder>"
+            raise SettingError("checkpoint", found="null", expected=expected)
+        return self
 
 
 class PhotoSettings(Settings):
@@ -666,7 +664,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "render": RenderSettings,
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
-    "prepare": PrepareSettings,
+    "prepare": RunSettings,
     "check": FilesSettings,
 }
 """Settings by the name of the command."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tangent_train.errors import SettingError, check_type
+from tangent_train.errors import SettingError
 from tangent_train.geometry.sphere import Floats
 
 
@@ -18,7 +17,6 @@ def half_width(fov_deg: float) -> float:
     Raises:
         SettingError: The field of view is not between 0° and 180°.
     """
-    check_type("fov", fov_deg, Real, "degrees")
     if not 0 < fov_deg < 180:
         raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")
     return math.tan(math.radians(fov_deg) / 2)

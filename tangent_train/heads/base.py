@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
@@ -283,10 +283,6 @@ class Head(nn.Module, ABC):
     def source(self) -> str:
         """Kind of output that holds the predicted pixels."""
         return next(iter(self.suffixes))
-
-    def count(self, mosaics: Iterable[Any]) -> str:
-        """Prepare for all predictions with those of some images; return a line to print, or ""."""
-        return ""
 
     def write_mosaic(self, mosaic: Any, image: Any, files: Mapping[str, Path]) -> None:
         """Write files, by kind, that need more than the predicted pixels of an image."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -35,7 +35,6 @@ from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import ScoreMosaic
 
 _ROWS_AT_ONCE = 64
-_BINS = 256
 
 
 class ClassesHead(Head):
@@ -51,8 +50,6 @@ class ClassesHead(Head):
         label_smoothing: Fraction of the target that is spread over all classes.
         absent_class: Treatment of classes absent from the ground truth in the means.
         min_confidence: Predicted pixels with a lower confidence, from 0 to 1, are unknown.
-        min_share: Smallest share of the pixels of each class to keep, which lowers
-            `min_confidence` for single classes, see `count`; 0 for one threshold for all.
     """
 
     kind: ClassVar[str] = PIXEL_CLASSES
@@ -67,7 +64,7 @@ class ClassesHead(Head):
         **sphere_columns("mIoU", labels="equal labels", miou="mIoU with the first labels"),
     }
     main_score: ClassVar[str] = "miou"
-    predict_settings = MappingProxyType({"min_confidence": "", "min_share": "min_confidence"})
+    predict_settings = MappingProxyType({"min_confidence": ""})
     summary: ClassVar[str] = "classes"
     suffixes = MappingProxyType(
         dict.fromkeys(("labels", "color", "overlay"), ".png") | {"probabilities": ".npy"}
@@ -82,15 +79,13 @@ class ClassesHead(Head):
         label_smoothing: float = 0.0,
         absent_class: AbsentClass = "skip",
         min_confidence: Annotated[float, Field(ge=0, le=1)] = 0.0,
-        min_share: float = 0.0,
     ) -> None:
         super().__init__(class_names)
         self.summary_columns = self.class_names
         self.num_outputs = len(self.class_names) - 1
         self.weighting, self.label_smoothing = class_weights, label_smoothing
         self.absent_class: AbsentClass = absent_class
-        self.min_confidence, self.min_share = min_confidence, min_share
-        self.thresholds: NDArray[np.float64] | None = None
+        self.min_confidence = min_confidence
         self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
         self.register_buffer("class_weights", torch.ones(self.num_outputs))
 
@@ -195,7 +190,6 @@ class ClassesHead(Head):
     ) -> LabelMosaic:
         """Return a mosaic of probabilities, which reuses the memory of an earlier one."""
         spare = self._spare.pop() if self._spare else None
-        averaged = averaged or self.min_share > 0
         mosaic = self._new_mosaic(shape, blend, averaged=averaged, spare=spare, **settings)
         if not isinstance(mosaic.sums, np.memmap):  # space on the disk is released at once
             weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
@@ -225,30 +219,9 @@ class ClassesHead(Head):
         """Return 1 − mIoU of one image, and the mIoU; 0 and "" without labeled pixels."""
         if not truth.any():
             return 0.0, ""
-        count = len(self.class_names)
-        counts = segmentation.count_image(prediction.cpu(), truth.cpu(), count).pixels
+        counts = segmentation.confusion(prediction.cpu(), truth.cpu(), len(self.class_names))
         miou = float(segmentation.segmentation_scores(counts).means["miou"])
         return 1 - miou, f"mIoU {100 * miou:.1f}\u00a0%"
-
-    def count(self, mosaics: Iterable[LabelMosaic]) -> str:
-        """Find the confidence that pixels of each class need for `min_share`.
-
-        One threshold for all classes keeps few pixels of rare classes, whose confidence is lower.
-        The threshold of a class is a quantile of its confidences, as in class-balanced
-        self-training (Zou et al., ECCV 2018).
-        """
-        if not self.min_share:
-            return ""
-        count = len(self.class_names)
-        counts = np.zeros((count, _BINS), np.int64)
-        for mosaic in mosaics:
-            valid = ... if mosaic.valid is None else mosaic.valid
-            labels, confidences = mosaic.pixels().cpu().numpy(), mosaic.confidences()
-            counts += count_confidences(labels[valid], confidences[valid], count - 1)
-        self.thresholds = class_thresholds(counts, self.min_confidence, self.min_share)
-        least = zip(self.class_names[1:], self.thresholds[1:], strict=True)
-        listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
-        return f"Smallest confidence of each class: {listed}."
 
     def write_mosaic(self, mosaic: Any, image: Any, files: Mapping[str, Path]) -> None:
         """Write the probabilities of an image, which take much memory."""
@@ -326,7 +299,7 @@ class LabelMosaic(ScoreMosaic):
         camera_matrix: Any = None,
         **settings: Any,
     ) -> None:
-        least = 0.0 if head.min_share else head.min_confidence
+        least = head.min_confidence
         super().__init__(shape, head.num_outputs, blend, min_confidence=least, **settings)
         self._head, self.valid = head, valid
 
@@ -337,11 +310,7 @@ class LabelMosaic(ScoreMosaic):
 
     def pixels(self) -> Tensor:
         """Return labels ``(H, W)``, 0 where unknown."""
-        labels, thresholds = self._head.labels_of(self.labels()), self._head.thresholds
-        if thresholds is None:
-            return labels
-        is_sure = self.confidences() >= thresholds[labels.cpu().numpy()]
-        return labels.where(torch.from_numpy(is_sure).to(labels.device), 0)
+        return self._head.labels_of(self.labels())
 
 
 class ImageClassHead(Head):
@@ -392,37 +361,3 @@ class ImageClassHead(Head):
 def exact(values: Tensor) -> Tensor:
     """Convert to at least float32, for sums over millions of pixels."""
     return values.to(torch.promote_types(values.dtype, torch.float32))
-
-
-def count_confidences(
-    labels: NDArray[np.integer], confidences: NDArray[np.floating], num_classes: int
-) -> NDArray[np.int64]:
-    """Return ``(K + 1, bins)`` pixels of each label by confidence from 0 to 1.
-
-    Args:
-        labels: Labels from 0 to K.
-        confidences: Confidence of each of them.
-        num_classes: K.
-    """
-    place = np.minimum(confidences * _BINS, _BINS - 1).astype(np.int64)
-    place += labels.astype(np.int64) * _BINS
-    return np.bincount(place.ravel(), minlength=(num_classes + 1) * _BINS).reshape(-1, _BINS)
-
-
-def class_thresholds(
-    counts: NDArray[np.int64], most: float, min_share: float
-) -> NDArray[np.float64]:
-    """Return the confidence that pixels of each label need, ``(K + 1,)``.
-
-    Args:
-        counts: Result of `count_confidences`.
-        most: Largest threshold, which labels without counted pixels have.
-        min_share: Share of the counted pixels of each label that is kept at least.
-
-    >>> counts = count_confidences(np.array([1, 1, 1, 1]), np.array([0.3, 0.5, 0.75, 0.95]), 2)
-    >>> class_thresholds(counts, 0.9, 0.5).tolist()
-    [0.9, 0.75, 0.9]
-    """
-    kept = counts[:, ::-1].cumsum(axis=1)[:, ::-1]  # at or above the lower edge of each bin
-    is_enough = kept >= min_share * kept[:, :1]
-    return np.minimum((is_enough.sum(axis=1) - 1) / _BINS, most)

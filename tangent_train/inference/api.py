@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from numbers import Real
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
@@ -27,7 +26,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from pydantic import PositiveInt
 from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps
@@ -39,9 +37,8 @@ from datamodules.core.label_map import (
     read_label_map,
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.config.build import checks_types
-from tangent_train.config.settings import Prompts, Threshold
-from tangent_train.errors import SettingError, at_least, check_choice, check_type, width_height
+from tangent_train.config.settings import Prompts
+from tangent_train.errors import SettingError, check_choice, width_height
 from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
@@ -55,13 +52,13 @@ from tangent_train.inference.images import (
     with_up,
 )
 from tangent_train.inference.views import Levels, ViewChoice, ViewSelector
-from tangent_train.io.gpano import Eye, Fill
+from tangent_train.io.gpano import Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
 from tangent_train.metrics.panoptic import LABEL
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
-from tangent_train.rendering.forward import check_grid, check_panorama
+from tangent_train.rendering.forward import check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic, blend_back
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.resampling import Pixels, reduce_to_pitch
@@ -75,8 +72,6 @@ Depth = Tensor | NDArray[Any] | None
 _Stored = str | Path | Image.Image | NDArray[Any]
 """Pictures whose results are arrays."""
 
-_SHOWN = 6
-
 
 class ImageSettings(TypedDict, total=False):
     """Arguments of the methods of `Network` besides the image, see `Network.labels`."""
@@ -85,7 +80,6 @@ class ImageSettings(TypedDict, total=False):
     area: Sequence[float] | None
     upright: Upright
     mask: Mask | str | NDArray[Any] | Tensor
-    eye: Eye | None
 
 
 class LabelSettings(ImageSettings, total=False):
@@ -96,22 +90,21 @@ class LabelSettings(ImageSettings, total=False):
     prompts: Prompts | None
 
 
-@checks_types
 def load(
     path: str | Path,
     *,
     prompts: Prompts | None = None,
-    threshold: Threshold | None = None,
+    threshold: float | None = None,
     label_map: str | Path | None = None,
     unmapped: Unmapped = "unknown",
     device: str | int | torch.device = "cpu",
     levels: Levels = None,
     base_level: int | None = None,
     blend: Blend = "feather",
-    rotations: PositiveInt = 1,
+    rotations: int = 1,
     views: ViewChoice = None,
     fill: Fill | None = None,
-    view_batch_size: PositiveInt | None = None,
+    view_batch_size: int | None = None,
     compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
     min_confidence: float = 0.0,
     align: Align | None = None,
@@ -156,7 +149,6 @@ def load(
         DataError: A file cannot be used.
         SettingError: A setting does not suit the network.
     """
-    check_type("path", path, (str, Path), "the path of a network's file")
     of_file = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
     # A setting of another head is an unexpected argument.
     of_head = {"min_confidence": min_confidence, "align": align}
@@ -171,7 +163,7 @@ def load(
         of_device = device, view_batch_size, compile
         return loaded, Predictor(loaded, head_of(loaded, **of_head), selector, *of_device)
 
-    return Network(of_file.prompted(prompts=prompts, threshold=threshold), prepared)
+    return Network(of_file.prompted(prompts, threshold), prepared)
 
 
 class Network:
@@ -207,14 +199,6 @@ class Network:
         self.palette = class_colors(tuple(self.class_names))
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
 
-    def __repr__(self) -> str:
-        """Return classes or kind of depth, inputs and device in one line."""
-        loaded, names = self.loaded, self.class_names[1:]
-        shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
-        predicts = f"{len(names)} classes ({shown})" if names else f"depth ({loaded.depth_kind})"
-        inputs = ", ".join(loaded.inputs)
-        return f"<Network of {predicts}, inputs {inputs}, on {self._predictor.device}>"
-
     @overload
     def labels(self, image: Tensor, **settings: Unpack[LabelSettings]) -> Tensor: ...
     @overload
@@ -231,7 +215,6 @@ class Network:
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
-        eye: Eye | None = None,
         prompts: Prompts | None = None,
     ) -> NDArray[Any] | Tensor:
         """Return the label of every pixel.
@@ -249,7 +232,6 @@ class Network:
             max_tilt_deg: Largest tilt that ``auto`` considers, in degrees.
             mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
                 a file; or 0 in an array or tensor. See `Masks`.
-            eye: Eye of a stereo panorama, see `eye_part`; the labels are those of its picture.
             prompts: Texts that become the classes of CLIPSeg or SAM 3, see `load`; the network
                 keeps them.
 
@@ -262,7 +244,7 @@ class Network:
             SettingError: The image cannot be used, or the network needs another input.
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye, prompts)
+        given = self._read(image, depth, fov, area, upright, max_tilt_deg, prompts)
         found = self._predictor.predict(given).pixels().cpu().numpy()
         if self.loaded.things:
             found = (found // LABEL).astype(np.uint8)
@@ -310,7 +292,7 @@ class Network:
         Args:
             image: A panorama, or a photo.
             mask: Pixels of a panorama that get NaN, see `labels`.
-            **settings: ``fov``, ``area``, ``upright`` and ``eye`` of `labels`. Of ``upright``, only
+            **settings: ``fov``, ``area`` and ``upright`` of `labels`. Of ``upright``, only
                 ``pose`` suits a depth network.
 
         Returns:
@@ -363,21 +345,18 @@ class Network:
         area: Sequence[float] | None = None,
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
-        eye: Eye | None = None,
         prompts: Prompts | None = None,
     ) -> InputImage:
         """Return a photo, or a panorama with its zenith; set the prompts."""
         if prompts not in (None, self._prompts):
-            self._use(self._original.prompted(prompts=prompts))
+            self._use(self._original.prompted(prompts))
             self._prompts = prompts
         is_given = depth is not None or "depth" in self.loaded.inputs
         of_size = partial(self._depth, depth) if is_given else None
         if fov is not None:
             return read_photo(image, fov, of_size)
         check_choice("upright", upright or "pose", ("pose", "auto"))
-        check_type("max_tilt_deg", max_tilt_deg, Real, "degrees")
-        check_choice("eye", eye or "left", ("left", "right"))
-        panorama = read_panorama(image, area, upright, of_size, eye)
+        panorama = read_panorama(image, area, upright, of_size)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._up_likelihood)
         return panorama
@@ -465,12 +444,8 @@ def apply(
     >>> apply(brightness, np.full((32, 64, 3), 0.5), TangentGrid(0, 4))[0, 0]
     np.float32(0.5)
     """
-    check_type("function", function, Callable, "a function of images")  # type: ignore[arg-type]
-    check_grid(grid)
     blend = blend_back(grid, blend)
     check_panorama(panorama, "bilinear")
-    if images_per_call is not None:
-        at_least("images_per_call", images_per_call, 1)
     step = images_per_call or views_per_forward(grid.size)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     shape, views = (rows, columns), PinholeViews(grid)
@@ -548,7 +523,6 @@ def load_label_map(given: str | Path) -> LabelMap:
         SettingError: There is no map of this name.
         DataError: The file is missing or is not a valid label map.
     """
-    check_type("label_map", given, (str, Path), "a name or a path")
     return read_label_map(label_map_file(given))
 
 

@@ -38,29 +38,6 @@ View = tuple[PinholeGrid, int]
 """An image of a grid, by its index."""
 
 _MOST_PIXELS = 2**20  # limit for rows and columns: a panorama of the size in the file is allocated
-_CONVENTIONS = {
-    "pixels": "Pixel centers are whole numbers: (0, 0) is the center of the upper left pixel, "
-    "columns count to the right, rows down. matrix (K) takes camera coordinates to (column, row). "
-    "For programs that count from pixel corners, add 0.5 to the principal point.",
-    "camera_axes": "x right, y down, z forward.",
-    "world_axes": "Right-handed, at the center of the panorama: x forward, to the middle column of "
-    "the panorama; y left, a quarter of the width to the left of it; z up, to the top row.",
-    "world_from_camera": "Rotation matrix by rows, determinant +1: a direction d of the camera is "
-    "world_from_camera · d in the world. All cameras stand at the origin.",
-    "icosahedron_rotation": "Rotation of the icosahedron as a whole, in the world axes; null if it "
-    "is not rotated.",
-    "views": "world_from_camera of all views. Tangent images are determined by base_level, level, "
-    "dim and icosahedron_rotation.",
-    "camera": "The camera of all images; null if the images have cameras of their own.",
-    "fov_deg": "Angle across the middle of an image, from edge to edge.",
-}
-_POSES = {
-    "panorama_axes": "Right-handed: x to the middle column of the panorama, y to the left of it, "
-    "z to the top row.",
-    "world_from_panorama": "Rotation matrix by rows, determinant +1: the point seen at distance r "
-    "in direction d of the panorama is location + r · world_from_panorama · d.",
-    "location": "Center of the panorama, in the world and the units of COLMAP's model.",
-}
 _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
 """Matches lists of numbers, which are written on one line."""
 
@@ -160,7 +137,7 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
 
     Args:
         path: File to write.
-        cameras: Content of the file. Its section ``conventions`` explains the fields.
+        cameras: Content of the file, see docs/reference/file_formats.md.
     """
     grid, views = cameras.grid, cameras.views
     described: dict[str, Any] = {
@@ -174,7 +151,6 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
     height, width = cameras.shape
     content = {
         "format": "tangent images",
-        "conventions": _CONVENTIONS,
         "source": {"file": cameras.source, "height": height, "width": width},
         **described,
         "camera": None if cameras.others else _camera(grid),
@@ -308,7 +284,7 @@ def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
     """Write poses of panoramas in a right-handed world as JSON.
 
     Args:
-        path: File to write. Its section ``conventions`` explains the fields.
+        path: File to write, see docs/reference/file_formats.md.
         poses: Pose of each panorama, by its file.
     """
     panoramas = [
@@ -319,7 +295,7 @@ def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
         }
         for file, pose in poses.items()
     ]
-    content = {"format": "panorama poses", "conventions": _POSES, "panoramas": panoramas}
+    content = {"format": "panorama poses", "panoramas": panoramas}
     _write_json(path, content)
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, listed, of_extra
 from tangent_train.files import atomic_path
-from tangent_train.io.image_files import MOST_PIXELS
 
 _MOST_NAMED = 100
 """Largest number of channels that a message names."""
@@ -23,13 +22,13 @@ def open_exr(
     """Read the header of an OpenEXR image.
 
     Args:
-        path: The file. In a file of several parts, the name of a part is the layer of its channels.
+        path: The file, of one part whose data window is the display window.
         channel: Name of the channel to decode; None for depth or colors.
 
     Returns:
-        Rows and columns of the display window; and a function that decodes its pixels, 0 outside
-        the data window: given True, the channel of depth, ``(H, W)`` as float32, float16 or uint32;
-        given False, the colors, ``(H, W, 3)`` as float32, or depth if there are no colors.
+        Rows and columns; and a function that decodes the pixels: given True, the channel of depth,
+        ``(H, W)`` as float32, float16 or uint32; given False, the colors, ``(H, W, 3)`` as float32,
+        or depth if there are no colors.
 
     Raises:
         SettingError: The OpenEXR package is missing.
@@ -37,55 +36,23 @@ def open_exr(
     with of_extra("exr", path, "Or convert the file to a float TIFF."):
         import OpenEXR
     with OpenEXR.File(str(path), header_only=True) as file:
-        # Closing the file clears its own headers.
-        headers = [dict(part.header) for part in file.parts]
-    windows = [_window(header["dataWindow"]) for header in headers]
-    if max(np.prod(shape) for _, shape in windows) > MOST_PIXELS:
-        raise ValueError(f"a data window of more than {MOST_PIXELS} pixels")
-    corner, size = _window(headers[0]["displayWindow"])
-    places = {
-        _full_name(header.get("name", "") if headers[1:] else "", one.name): (part, one.name)
-        for part, header in enumerate(headers)
-        for one in header["channels"]
-    }
+        headers = [dict(part.header) for part in file.parts]  # cleared when the file is closed
+    windows = {str(of[name]) for of in headers for name in ("dataWindow", "displayWindow")}
+    if len(headers) != 1 or len(windows) != 1:
+        raise ValueError("several parts, or a data window beside the display window")
+    first, last = (np.asarray(corner, np.int64)[::-1] for corner in headers[0]["dataWindow"])
+    size, known = tuple((last - first + 1).tolist()), [one.name for one in headers[0]["channels"]]
 
     def decode(indices: bool) -> NDArray[Any]:
-        names = _chosen_names(path, list(places), channel, indices=indices)
-        decoded = []
+        names = _chosen_names(path, known, channel, indices=indices)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            if len(file.parts) != len(headers):  # the package leaves broken parts out
-                raise ValueError("a broken part")
-            for part, name in (places[name] for name in names):
-                pixels: NDArray[Any] = file.parts[part].channels[name].pixels
-                first, shape = windows[part]
-                if pixels.dtype == object or pixels.shape != tuple(shape):
-                    raise ValueError(f"channel {name}: several samples per pixel, or subsampled")
-                decoded.append(_placed(pixels, first - corner, size))
+            channels = file.parts[0].channels
+            decoded: list[NDArray[Any]] = [channels[name].pixels.copy() for name in names]
+        if any(pixels.dtype == object or pixels.shape != size for pixels in decoded):
+            raise ValueError("several samples per pixel, or subsampled")
         return decoded[0] if len(decoded) == 1 else np.stack(decoded, -1).astype(np.float32)
 
-    return (int(size[0]), int(size[1])), decode
-
-
-def _window(corners: Any) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the row and column of the first pixel, and the numbers of rows and columns."""
-    first, last = (np.asarray(corner, np.int64)[::-1] for corner in corners)
-    return first, last - first + 1
-
-
-def _placed(
-    pixels: NDArray[Any], offset: NDArray[np.int64], size: NDArray[np.int64]
-) -> NDArray[Any]:
-    """Place pixels at a row and column of an image of zeros; cut them to it."""
-    image = np.zeros(size, pixels.dtype)
-    (top, left), (bottom, right) = offset, np.maximum(offset + pixels.shape, 0)
-    inside = image[max(top, 0) : bottom, max(left, 0) : right]
-    inside[:] = pixels[max(-top, 0) :, max(-left, 0) :][: inside.shape[0], : inside.shape[1]]
-    return image
-
-
-def _full_name(part: str, channel: str) -> str:
-    has_name = not part or channel == part or channel.startswith(f"{part}.")
-    return channel if has_name else f"{part}.{channel}"
+    return (size[0], size[1]), decode
 
 
 def _chosen_names(

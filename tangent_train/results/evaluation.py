@@ -20,7 +20,7 @@ from pydantic import TypeAdapter
 from tangent_train.errors import DataError, counted, listed
 from tangent_train.files import csv_text, read_json, write_bytes, write_text
 from tangent_train.metrics.image_sums import Sums, as_sums, drawn_scores, intervals, means_of_sums
-from tangent_train.metrics.scores import BAND_EDGES_DEG, SOLID_ANGLE, Interval, ScoreColumn
+from tangent_train.metrics.scores import BAND_EDGES_DEG, Interval, ScoreColumn
 from tangent_train.results.tables import Table, markdown_text, score_text
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class EvaluationResult:
         noun: Plural name of the images: panoramas, photos, shapes.
         images: Number of images.
         columns: Names and units of all scores, in the order of the tables.
-        scores: Scores over all images. The first is the main score, used by charts and latitudes.
+        scores: Scores over all images. The first is the main score, used by tables of latitudes.
         classes: Name (``class``) and scores of each class; empty without classes.
         latitude_bands: Edges ``latitude_deg`` (south, north) and scores of each band; empty for
             photos.
@@ -280,11 +280,6 @@ def result_tables(result: EvaluationResult) -> list[Table]:
 def _mean(result: EvaluationResult, name: str) -> str:
     unit = result.columns[name].unit
     return score_text(result.scores[name], unit, result.intervals.get(name))
-
-
-def _is_shown(result: EvaluationResult, name: str) -> bool:
-    """Return False for a score by solid angle of photos, over all of them."""
-    return bool(result.latitude_bands) or not name.endswith(SOLID_ANGLE)
 
 
 def _over_all(result: EvaluationResult, title: str = "Scores", *, of_sphere: bool = False) -> Table:

@@ -45,21 +45,6 @@ def test_a_line_per_epoch(capsys: pytest.CaptureFixture[str]) -> None:
     assert second == "Epoch 2 of 2, train/loss 0.250"
 
 
-def test_a_line_names_the_epoch_of_an_older_score(capsys: pytest.CaptureFixture[str]) -> None:
-    class Validated(_Model):
-        def validation_step(self, batch: Any, batch_idx: int) -> None:
-            self.log("val/miou", torch.tensor(0.5), prog_bar=True)
-
-    trainer = _trainer(max_epochs=4, check_val_every_n_epoch=2, num_sanity_val_steps=0)
-    trainer.fit(Validated())
-    lines = [line.split(", ")[:3] for line in capsys.readouterr().out.splitlines()]
-    assert [line[0] for line in lines] == [f"Epoch {n} of 4" for n in (1, 2, 3, 4)]
-    assert "val/" not in lines[0][-1]
-    assert [line[2] for line in lines[1:]] == [
-        *("val/miou 0.500", "val/miou (epoch 2) 0.500", "val/miou 0.500")
-    ]
-
-
 def test_a_line_whenever_a_minute_has_passed(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

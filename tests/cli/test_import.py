@@ -201,7 +201,7 @@ def test_an_onnx_file_predicts_depth(
     write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32), *after, **axes)
     run("import", *OF_DEPTH, "image_size=32")
     printed = capsys.readouterr().out
-    assert "depth: metric_z\nthe network returns z-depth in meters\n" in printed
+    assert "MB\nthe network returns metric_z\n" in printed
     assert "panoramas: 16 views of 32 × 32 (130° wide" in printed
     assert printed.splitlines()[-1].startswith("panoramas"), "no remarks"
     trained = load_network(here / "ours.onnx")

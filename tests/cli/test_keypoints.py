@@ -65,17 +65,6 @@ def test_two_panoramas_are_a_pair(
     assert "Results are in out_1." in capsys.readouterr().out
 
 
-def test_export_for_colmap(run: Run, tmp_path: Path, panoramas: Path) -> None:
-    run(f"input={panoramas}", *SMALL, "output=out", "export=true")
-    rows = results(tmp_path / "out")["rows"]
-    for k, name in enumerate(("ERP", "L0")):
-        with pycolmap.Database.open(tmp_path / f"out/export/{name}/database.db") as database:
-            names = [image.name for image in database.read_all_images()]
-            assert names == ["a.png", "b.png", "c.png"]
-            assert database.num_matches() == sum(row["putative"] for row in rows[k::2])
-            assert database.num_inlier_matches() == sum(row["inliers"] for row in rows[k::2])
-
-
 def test_an_interrupted_run_goes_on(
     run: Run, panoramas: Path, tmp_path: Path, monkeypatch: Patch, capsys: Capture
 ) -> None:

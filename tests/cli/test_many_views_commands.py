@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from models import DepthAnything3
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import SettingError
 from tangent_train.inference.export import export_network
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tangent_train.photo_networks import PhotoNetwork, import_network
-from tests.cli.tiny_runs import Predict, Run
+from tests.cli.tiny_runs import Predict, Run, results
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.inference.test_many_views import UNIT
 from tests.inference.trained import sphere
@@ -65,3 +67,34 @@ def test_imported_networks_predict_evaluate_and_are_exported(
     assert again.network.takes_cameras
     with pytest.raises(SettingError, match="without their cameras"):
         export_network(loaded, tmp_path / "net.onnx")
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_depth_anything_3_is_imported_predicts_is_evaluated_and_exported(
+    tmp_path: Path, run: Run, predict: Predict
+) -> None:
+    """The small network of the package, with random weights."""
+    pytest.importorskip("depth_anything_3")
+    torch.manual_seed(0)
+    tensors = DepthAnything3("da3-small").state_dict()
+    save_file({name: tensor.clone() for name, tensor in tensors.items()}, "da3.safetensors")
+    given = "network=depth_anything_3", "network.preset=da3-small", "weights=da3.safetensors"
+    described = "depth=relative_z", "normalization=imagenet", "image_size=56"
+    run("import", *given, *described, "output=da3.ckpt")
+    write_pixels(tmp_path / "in" / "hall.png", sphere(64))
+    entry = predict(checkpoint="da3.ckpt", write="[depth]")["hall"]["depth"]
+    assert (entry["known"], entry["unit"]) == (1, "relative")
+    assert entry["median"] == pytest.approx(1, rel=0.1)
+    assert 0 <= entry["rotation_error_deg"] <= 180
+    data = "data=folder", "task=depth", "data.root=rooms", "data.inputs=[rgb]"
+    write_data_set(tmp_path / "rooms", each=1, height=64, depth=True)
+    how = "task.head.alignment=median", "+representation.erp_height=64", "hydra.run.dir=scores"
+    run("evaluate", "checkpoint=da3.ckpt", *data, *how)
+    scores = results(tmp_path / "scores")
+    assert scores["protocol"]["alignment"] == "median in distance"
+    assert 0 < scores["scores"]["absrel"] < 10
+    run("export", "checkpoint=da3.ckpt", "output=net.safetensors")
+    again = load_network(tmp_path / "net.safetensors").module.state_dict()
+    assert all(torch.equal(again[name], tensor) for name, tensor in tensors.items())
+    with pytest.raises((SettingError, SystemExit), match="without their cameras"):
+        run("export", "checkpoint=da3.ckpt", "output=net.onnx")

@@ -203,41 +203,12 @@ def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predi
         predict(depth=depth, output="none")
 
 
-def test_a_share_of_each_class_is_kept_below_the_least_confidence(
-    tmp_path: Path, predict: Predict, capsys: Capture
-) -> None:
-    """The most confident half of each class over all images, which show a part of the sphere."""
-    for number in range(3):
-        strip = sphere(32)[8:24] // (1 + number) + np.uint8(20 * number)
-        write_pixels(tmp_path / "in" / f"{number}.png", strip)
-    given = {"area": "[-180,180,-45,45]", "write": "[labels,probabilities]", "report": 0}
-    whole, half = tmp_path / "whole", tmp_path / "half"
-    predict(**given, output=whole)
-    predict(**given, output=half, min_confidence=0.999, min_share=0.5)
-    assert "Smallest confidence of each class: dark 0." in capsys.readouterr().out
-    before, after = (
-        np.stack([read_png(folder / "labels" / f"{n}.png") for n in range(3)])
-        for folder in (whole, half)
-    )
-    best = np.stack([np.load(whole / f"probabilities/{n}.npy").max(axis=-1) for n in range(3)])
-    assert set(np.unique(before)) == {1, 2, 3}
-    for label in (1, 2, 3):
-        of_class = best[before == label].astype(np.float64)
-        kept = after[before == label] == label
-        assert (kept | (after[before == label] == 0)).all()
-        median = np.quantile(of_class, 0.5, method="inverted_cdf")
-        assert kept[of_class > median].all()
-        assert not kept[of_class < median - 1 / 256 - 1e-3].any()
-        assert 0.5 <= kept.mean() < 1
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"input": "nowhere"}, "nowhere"),
         ({"device": "abacus"}, "device"),
         ({"min_confidence": 70}, "min_confidence: found 70.* less than or equal to 1"),
-        ({"min_share": 0.5}, "min_share: found 0.5; expected 0.*: nothing reads it"),
         ({"fov": 70}, "fov: found 70.0; expected null: nothing reads it"),
         ({"max_tilt_deg": 90}, "max_tilt_deg: found 90.0; expected 60: nothing reads it"),
         ({"unmapped": "never"}, "unmapped: found never; expected unknown: nothing reads it"),

@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -22,7 +23,7 @@ from tangent_train.io.camera_files import write_poses
 from tangent_train.io.pixel_files import read_depth_m, read_pixels, write_pixels
 from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import read_png
-from tests.inference.trained import sphere, write_depth_checkpoint
+from tests.inference.trained import sphere, write_checkpoint, write_depth_checkpoint
 from tests.results.box_room import exit_points
 from tests.running import Capture
 
@@ -119,6 +120,50 @@ def test_the_sky_of_a_label_map_has_no_distance(
     unknown = labels == 3
     unknown[53:] = True
     np.testing.assert_array_equal(_depth(tmp_path / "out" / "depth" / "a.png") == 0, unknown)
+
+
+@pytest.mark.parametrize("across", [{}, {"align_across": "frames"}])
+def test_classes_of_a_network_have_no_distance(
+    tmp_path: Path, network: Path, predict: Predict, across: dict[str, str]
+) -> None:
+    """A green part of a dark panorama, which has no distance, point and normal, up to its edge."""
+    green, edge = np.zeros((64, 128), np.uint8), np.ones((7, 7), np.uint8)
+    green[6:26, 20:70] = 1
+    rgb = np.where(green[..., None] > 0, np.array([0, 250, 0]), sphere(64) // 4).astype(np.uint8)
+    write_pixels(tmp_path / "in" / "a.png", rgb)
+    write_pixels(tmp_path / "in" / "b.png", rgb)
+    masks = {"mask": f"[-60,{write_checkpoint(tmp_path / 'net.ckpt')}]", "mask_classes": "[green]"}
+    entries = predict(checkpoint=network, write="[depth,points,normals]", **masks, **across)
+    for name in "ab":
+        unknown = _depth(tmp_path / "out" / "depth" / f"{name}.png") == 0
+        assert unknown[53:].all()
+        assert unknown[cv2.erode(green, edge) > 0].all()
+        assert not unknown[:53][cv2.dilate(green, edge)[:53] == 0].any()
+        assert entries[name]["depth"]["known"] == 1, "masked pixels do not count"
+        normals = read_pixels(tmp_path / "out" / "normals" / f"{name}.exr", indices=False)
+        np.testing.assert_array_equal(normals.any(axis=-1), ~unknown)
+        cloud = trimesh.load(tmp_path / "out" / "points" / f"{name}.ply")
+        assert len(cloud.vertices) == (~unknown).sum()
+
+
+@pytest.mark.parametrize(
+    ("mask", "classes", "refused"),
+    [
+        ("net.ckpt", "[sky]", "mask_classes: found sky; expected of dark, green, bright"),
+        ("net.ckpt", "null", "mask_classes: found null; expected of dark, green, bright"),
+        ("depth.ckpt", "[sky]", "that predicts pixel_classes. mask=.*depth.ckpt masks classes"),
+        ("rgbd.ckpt", "[green]", "mask: found .*rgbd.ckpt, a network that takes depth"),
+    ],
+)
+@pytest.mark.usefixtures("network")
+def test_other_networks_are_no_masks(
+    tmp_path: Path, predict: Predict, mask: str, classes: str, refused: str
+) -> None:
+    write_checkpoint(tmp_path / "net.ckpt")
+    write_checkpoint(tmp_path / "rgbd.ckpt", channels=4)
+    write_pixels(tmp_path / "in" / "a.png", sphere(16))
+    with pytest.raises(SystemExit, match=refused):
+        predict(mask=mask, mask_classes=classes)
 
 
 def test_frames_get_one_scale(

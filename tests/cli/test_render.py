@@ -38,17 +38,6 @@ def rendered(room: Path, tmp_path: Path) -> Path:
 # There and back.
 
 
-@pytest.mark.parametrize(("eye", "other"), [("left", "right"), ("right", "left")])
-def test_the_picture_of_one_eye_is_rendered(tmp_path: Path, eye: str, other: str) -> None:
-    pictures = {eye: smooth(), other: 255 - smooth()}
-    write_pixels(tmp_path / "a.png", np.concatenate([pictures["left"], pictures["right"]]))
-    render_with(input=tmp_path / "a.png", output=tmp_path / "out", base_level=0, eye=eye)
-    files = read_cameras(tmp_path / "out" / "a" / "cameras.json").files
-    expected = equirect_to_tangent(smooth(), TangentGrid(0, 5))
-    for file, image in zip(files, expected, strict=True):
-        np.testing.assert_array_equal(_read(tmp_path / "out" / "a" / file), image)
-
-
 def test_channels_of_openexr_images(tmp_path: Path) -> None:
     path, colors = tmp_path / "a.exr", smooth().astype(np.float32)
     channels = {c: colors[..., i].copy() for i, c in enumerate("RGB")}
@@ -224,8 +213,6 @@ def test_level_views_come_back_in_place(tmp_path: Path, blend: str, refused: Ref
     np.save(tmp_path / "features" / "face_003.npy", np.zeros((20, 20, 3), np.float32))
     message = refused(output=tmp_path / "no.npy", **settings)
     assert "face_003.npy: found float32 of shape (20, 20, 3)" in message
-    given = {"views": views, "figure": "a.png"}
-    assert "figure: found" in refused(input=tmp_path / "room.png", **given)
     for changes in ({"views": "erp"}, {"views": views, "base_level": 0}):
         message = refused(input=tmp_path / "room.png", output=tmp_path / "no", **changes)
         assert "views: found" in message
@@ -288,14 +275,6 @@ def test_yaw_pitch_roll(
     assert found is not None
     np.testing.assert_allclose(found @ (1, 0, 0), forward, atol=1e-12)
     np.testing.assert_allclose(found @ (0, 1, 0), right, atol=1e-12)
-
-
-def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
-    figure = tmp_path / "figure.png"
-    render_with(input=room, figure=figure, base_level=0)
-    assert _read(figure).shape[1] == 1600
-    message = refused(input=room, figure=figure, output=tmp_path / "tan")
-    assert "figure.png, which exists" in message
 
 
 def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Refused) -> None:
@@ -385,8 +364,8 @@ _IN = {"input": "in", "output": "tan"}
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({}, "found none of them; expected input=<panoramas>, back="),
-        ({"input": "in"}, "found input; expected .* and output="),
+        ({"output": "o"}, "found none of them; expected input=<panoramas>, back="),
+        ({"input": "in"}, "Missing: output="),
         ({**_IN, "format": "gif"}, "format: found gif; expected 'png', "),
         (
             {**_IN, "interpolation": "nearest", "format": "jpg"},

@@ -248,7 +248,7 @@ def test_distances(data: Any, run: Run, tmp_path: Path) -> None:
             "checkpoint: found a value; expected nothing",
         ),
         (("predictions=maps", "representation=tangent"), "representation: found"),
-        (("checkpoint=net.ckpt", "values=ids"), "values: found a value; expected nothing"),
+        (("checkpoint=net.ckpt", "values=ids"), "values: found ids; expected null"),
         ((), "checkpoint: found null; expected a network, or predictions="),
         (("predictions=empty",), "empty: found no usable prediction for 3 panoramas"),
         (("predictions=maps", "values=c.json"), "c.json: found sofa; expected classes of dark"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-import torch
 
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
@@ -58,12 +57,6 @@ def pair(first: Any, second: Any = None) -> tuple[Any, Any]:
 def test_errors_in_one_line(section: Any, message: str) -> None:
     with pytest.raises(SettingError, match=message):
         build_from_config(section, "network")
-
-
-def test_errors_of_an_optimizer_that_is_built_later_are_explained() -> None:
-    build = build_from_config({**ADAM, "lr": -1}, "optimizer")
-    with pytest.raises(SettingError, match=r"^optimizer: .*Adam, .*Invalid learning rate: -1"):
-        build([torch.zeros(1, requires_grad=True)])
 
 
 def test_errors_of_ones_own_class_are_raised_as_they_are() -> None:

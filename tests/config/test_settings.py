@@ -196,8 +196,8 @@ def test_settings_of_one_name_are_explained_apart() -> None:
         ("export", "output=x.onnx", "tangent-export: Missing: checkpoint=. Example: "),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
         ("train", "", "Missing: data= or experiment="),
-        ("check", "data=folder data.root=no", "data.root: found no, no such folder"),
-        ("evaluate", "checkpoint=. data=synthrooms label_map=no.json", "label_map: found no.json"),
+        ("evaluate", "data=synthrooms", "checkpoint: found null; expected a network, or"),
+        ("check", "data=synthrooms values=ids", "values: found ids; expected null: nothing reads"),
     ],
 )
 def test_answers_before_anything_heavy_is_imported(

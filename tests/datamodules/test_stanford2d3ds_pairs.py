@@ -57,7 +57,7 @@ def test_the_table_is_the_papers() -> None:
 def test_all_pairs_are_found(area: Path) -> None:
     pairs = StanfordPairs(area)
     assert list(pairs.published) == pairs.names == [str(k) for k in range(60)]
-    assert len(pairs.files) == len(set(pairs.files)) == 87
+    assert len({side.rgb for _, *both in pairs.pairs for side in both}) == 87
     pair = pairs.read(24)
     assert (pair.name, pair.split) == ("24", "easy")
     assert re.fullmatch(r"area_1/hallway_6/ee20957[0-9a-f]{25}", pair.left.name)
@@ -112,7 +112,7 @@ def test_pairs_of_synthetic_rooms_agree_in_depth_and_pose(rooms: Path) -> None:
         assert _disagreement(pair.left, pair.right) < 0.04
         assert _disagreement(pair.left._replace(pose=pair.right.pose), pair.right) > 0.1
         # The documented formula: c + d Rᵀ (s_y, −s_z, s_x).
-        path = str(pair.left.file).replace("rgb", "pose").replace(".png", ".json")
+        path = str(pairs.pairs[index][1].rgb).replace("rgb", "pose").replace(".png", ".json")
         record = json.loads(Path(path).read_text())
         rotation, s = np.array(record["camera_rt_matrix"])[:, :3], (0.6, -0.48, 0.64)
         expected = np.array(record["camera_location"]) + 2.5 * rotation.T @ [s[1], -s[2], s[0]]

@@ -236,11 +236,6 @@ def test_images_and_settings_that_do_not_fit_are_refused(
         network.labels(image, **settings)
 
 
-def test_a_tilt_that_is_not_a_number_is_refused(network: Any) -> None:
-    with pytest.raises(TypeError, match="max_tilt_deg: found str; expected degrees"):
-        network.labels(_RGB, max_tilt_deg="60")
-
-
 def test_settings_that_do_not_suit_the_network_are_refused(tmp_path: Path) -> None:
     path = write_checkpoint(tmp_path / "net.ckpt", TANGENT)
     with pytest.raises(SettingError, match="unexpected keyword argument 'base_level'"):

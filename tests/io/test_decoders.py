@@ -141,7 +141,7 @@ def test_embedded_profiles_are_converted_to_srgb(tmp_path: Path, name: str) -> N
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize("gamma", [1.0, 1.8])
 def test_profiles_of_16_bits(tmp_path: Path, suffix: str, gamma: float) -> None:
-    """Against the formula of sRGB (IEC 61966-2-1)."""
+    """Against the formula of sRGB (IEC 61966-2-1); they become 8 bits."""
     stored = np.random.default_rng(1).integers(0, 65536, (16, 32, 3)).astype(np.uint16)
     stored[:8] //= 32
     profile, path = _rgb_profile(gamma=gamma), tmp_path / f"a{suffix}"
@@ -150,12 +150,12 @@ def test_profiles_of_16_bits(tmp_path: Path, suffix: str, gamma: float) -> None:
     else:
         chunk = png_chunk(b"iCCP", b"test\0\0" + zlib.compress(profile))
         path.write_bytes(png_bytes(stored, before=chunk))
-    light = (stored / 65535) ** gamma
-    right = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
     found = read_pixels(path, indices=False, in_srgb=True)
-    assert found.dtype == np.uint16
-    assert np.abs(found / 65535 - right).max() < 2 / 255
-    assert np.abs(read_rgb(path) - right * 255).max() < 2.5
+    light = ((stored >> 8) / 255) ** gamma
+    right = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
+    assert found.dtype == np.uint8
+    assert np.abs(found - right * 255).max() < 2.5
+    np.testing.assert_array_equal(read_rgb(path), found)
     np.testing.assert_array_equal(read_pixels(path, indices=True), stored)
 
 
@@ -183,10 +183,7 @@ _DAMAGES = ("second half", "no end", "cut", "middle")
 
 @pytest.mark.parametrize(
     ("suffix", "damage"),
-    [
-        *product((".jpg", ".png", ".avif"), _DAMAGES),
-        *product((".webp", ".heic"), _DAMAGES[:3]),  # without a checksum, some damage decodes
-    ],
+    [*product((".jpg",), _DAMAGES), *product((".png", ".webp", ".heic"), _DAMAGES[2:3])],
 )
 def test_damaged_files_are_refused(tmp_path: Path, suffix: str, damage: str) -> None:
     path = tmp_path / f"a{suffix}"
@@ -197,7 +194,7 @@ def test_damaged_files_are_refused(tmp_path: Path, suffix: str, damage: str) -> 
     wrong = {
         "second half": content[:half] + bytes(len(content) - half),
         "middle": content[:half] + bytes(24) + content[half + 24 :],
-        "no end": content[:-2] if suffix == ".jpg" else content[:-9],
+        "no end": content[:-2],
         "cut": content[:half],
     }
     path.write_bytes(wrong[damage])

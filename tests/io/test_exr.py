@@ -51,24 +51,15 @@ def test_pixels_are_as_written(tmp_path: Path, header: Any, dtype: type[Any]) ->
     np.testing.assert_array_equal(read, depth)
 
 
-@pytest.mark.parametrize(
-    "window",
-    [(0, 0, 95, 39), (10, 20, 105, 59), (-4, -6, 91, 33), (10, -5, 105, 34), (200, 9, 295, 48)],
-)
-def test_pixels_are_placed_in_the_display_window(tmp_path: Path, window: Any) -> None:
-    windows = {"dataWindow": _window(*window), "displayWindow": _window(0, 0, 95, 47)}
-    colors = np.stack([_DEPTH, 2 * _DEPTH, 3 * _DEPTH], -1)
-    channels: dict[str, Any] = {c: colors[..., i].copy() for i, c in enumerate("RGB")}
-    path = _write(tmp_path / "a.exr", {"Z": _DEPTH, **channels}, **windows)
-    expected = np.zeros((48, 96), np.float32)
-    for row, column in np.ndindex(_DEPTH.shape):
-        y, x = row + window[1], column + window[0]
-        if 0 <= y < 48 and 0 <= x < 96:
-            expected[y, x] = _DEPTH[row, column]
-    assert read_image_size(path) == (48, 96)
-    np.testing.assert_array_equal(read_depth_m(path, 1000), expected)
-    scaled = expected[..., None] * np.array([1, 2, 3], np.float32)
-    np.testing.assert_array_equal(read_pixels(path, indices=False), scaled)
+def test_a_part_of_the_display_window_and_several_parts_are_refused(tmp_path: Path) -> None:
+    windows = {"dataWindow": _window(0, 0, 95, 39), "displayWindow": _window(0, 0, 95, 47)}
+    path = _write(tmp_path / "a.exr", {"Z": _DEPTH}, **windows)
+    with pytest.raises(DataError, match="several parts, or a data window beside"):
+        read_image_size(path)
+    parts = [OpenEXR.Part({"name": name}, {"Z": _DEPTH}) for name in ("left", "right")]
+    OpenEXR.File(parts).write(str(path))
+    with pytest.raises(DataError, match="several parts, or a data window beside"):
+        read_image_size(path)
 
 
 _RGBA = [*"RGBA"]
@@ -150,28 +141,8 @@ def test_colors_are_those_of_the_main_or_only_layer(tmp_path: Path) -> None:
         read_pixels(path, indices=False)
 
 
-def _part(name: str, *channels: str, factor: float = 1) -> Any:
-    pixels = {channel: np.float32(factor) * _DEPTH for channel in channels}
-    return OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage}, pixels)
-
-
-@pytest.mark.parametrize(
-    "part", [("depth", "Z"), ("Z", "Z"), ("L.Depth", "L.Depth.V"), ("rest", "depth.Z")]
-)
-def test_parts_are_layers(tmp_path: Path, part: tuple[str, str]) -> None:
-    path = tmp_path / "a.exr"
-    others = [_part("rgba", *"RGBA", factor=2), _part("normal", "X", "Y", "Z", factor=3)]
-    OpenEXR.File([*others, _part(*part)]).write(str(path))
-    np.testing.assert_array_equal(read_depth_m(path, 1000), _DEPTH)
-    np.testing.assert_array_equal(read_depth_m(path, 1000, "normal.Y"), 3 * _DEPTH)
-    np.testing.assert_array_equal(read_pixels(path, indices=False)[..., 1], 2 * _DEPTH)
-
-
 def test_unsuitable_files(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
-    OpenEXR.File([_part("left", "Z"), _part("right", "Z")]).write(str(path))
-    with pytest.raises(DataError, match=r"a\.exr: found none; .* left\.Z, right\.Z"):
-        read_pixels(path, indices=True)
     deep = np.empty((4, 3), object)
     for place in np.ndindex(4, 3):
         deep[place] = np.ones(1 + place[0], np.float32)

@@ -14,14 +14,10 @@ from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_to_lonlat
 from tangent_train.inference.images import read_panorama
 from tangent_train.io.gpano import (
-    PART_TAGS,
-    Eye,
     PanoramaArea,
-    eye_part,
     read_area,
     read_tags,
     read_up,
-    shape_of,
 )
 from tangent_train.orientation.gravity import up_from_pose
 from tests.datamodules.data_files import (
@@ -308,61 +304,13 @@ def test_impossible_poses_are_refused(tmp_path: Path, axis: str, value: str) -> 
         read_up(path)
 
 
-_TOP, _BOTTOM = np.s_[0:64, 0:128], np.s_[64:128, 0:128]
-_LEFT, _RIGHT = np.s_[0:64, 0:128], np.s_[0:64, 128:256]
-_FULL = dict(zip(PART_TAGS, map(str, (800, 800, 800, 800, 0, 0)), strict=True))
-_HALF_SPHERE = dict(zip(PART_TAGS, map(str, (800, 400, 400, 400, 200, 0)), strict=True))
-
-
-@pytest.mark.parametrize(
-    ("size", "tags", "area", "left", "right"),
-    [
-        ((128, 128), {}, None, _TOP, _BOTTOM),
-        ((64, 256), {}, None, _LEFT, _RIGHT),
-        ((128, 128), {"StereoMode": "Bottom-Top"}, None, _BOTTOM, _TOP),
-        ((128, 128), {"StereoMode": "mono"}, None, _TOP, _BOTTOM),
-        ((128, 128), _FULL, None, _TOP, _BOTTOM),
-        ((64, 128), _HALF_SPHERE, None, np.s_[0:64, 0:64], np.s_[0:64, 64:128]),
-        ((128, 64), {}, [-90, 90, -90, 90], np.s_[0:64, 0:64], np.s_[64:128, 0:64]),
-    ],
-)
-def test_the_picture_of_an_eye(
-    size: tuple[int, int], tags: dict[str, str], area: Any, left: Any, right: Any
-) -> None:
-    """By metadata, or the layout in which both are whole or of the area."""
-    eyes: dict[Eye, Any] = {"left": left, "right": right}
-    for eye, part in eyes.items():
-        assert eye_part(Path("a"), size, eye, area, tags) == part
-        shape = shape_of(size, part)
-        assert read_area(Path("a"), shape, area, tags=tags).image_shape == shape
-    if "top" in tags.get("StereoMode", "").lower():
-        with pytest.raises(DataError, match=r"a: found a stereo panorama .*eye=left or eye=right"):
-            eye_part(Path("a"), size, None, area, tags)
-    else:
-        assert shape_of(size, eye_part(Path("a"), size, None, area, tags)) == size
-        with pytest.raises(DataError, match=r"stereo panorama.*eye=left or eye=right"):
-            read_area(Path("a"), size, area, tags=tags)
-
-
-def test_unknown_kinds_of_stereo_are_refused() -> None:
-    with pytest.raises(DataError, match=r"a: found a stereo panorama \(custom\)"):
-        eye_part(Path("a"), (64, 128), None, None, {"StereoMode": "custom"})
-
-
-@pytest.mark.parametrize(
-    ("size", "tags", "area"),
-    [
-        ((64, 128), {}, None),
-        ((40, 60), GPANO_TAGS, None),
-        ((64, 256), {}, [-180, 180, -45, 45]),
-        ((64, 128), {"StereoMode": "top-bottom"}, None),
-    ],
-)
-def test_an_eye_of_what_is_not_stereo_is_refused(
-    size: tuple[int, int], tags: dict[str, str], area: Any
-) -> None:
-    with pytest.raises(DataError, match=r"a: found .*two pictures.*Leave eye= out"):
-        eye_part(Path("a"), size, "right", area, tags)
+@pytest.mark.parametrize("mode", ["top-bottom", "left-right", "custom"])
+def test_stereo_panoramas_are_refused(mode: str) -> None:
+    with pytest.raises(DataError, match=rf"a: found a stereo panorama \({mode}\).*one eye"):
+        read_area(Path("a"), (64, 128), tags={"StereoMode": mode})
+    for size in ((128, 128), (64, 256)):  # by their shape
+        with pytest.raises(DataError, match=r"twice as wide as high.*cut out the picture of one"):
+            read_area(Path("a"), size, tags={"StereoMode": "mono"})
 
 
 def test_spherical_tags_of_exiftool_are_read(tmp_path: Path) -> None:

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image, ImageCms, TiffImagePlugin, features
+from PIL import Image, ImageCms, features
 
 from tangent_train.errors import DataError, SettingError
-from tangent_train.io import pixel_files
 from tangent_train.io.pixel_files import (
     check_writable,
     photo_fov_deg,
@@ -291,22 +290,6 @@ def test_layouts_of_tiff_files_that_are_not_decoded_are_refused(
         read_pixels(path, indices=False)
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-@pytest.mark.parametrize("kinds", [[1, 0], [1, 1, 0], [0, 1], [1], [1, 1]])
-def test_thumbnails_before_a_page_of_a_tiff_file_are_passed_over(
-    tmp_path: Path, dtype: Any, kinds: list[int]
-) -> None:
-    """The first page is read where all are marked as thumbnails."""
-    pages = [np.full((4 + n, 6), n + 1, dtype) for n in range(len(kinds))]
-    path, chosen = tmp_path / "image.tif", pages[kinds.index(0) if 0 in kinds else 0]
-    with path.open("w+b") as file, TiffImagePlugin.AppendingTiffWriter(file) as writer:
-        for page, kind in zip(pages, kinds, strict=True):
-            Image.fromarray(page).save(writer, "TIFF", tiffinfo={254: kind})
-            writer.newFrame()
-    np.testing.assert_array_equal(read_pixels(path, indices=True), chosen)
-    assert read_image_size(path) == chosen.shape
-
-
 @pytest.mark.parametrize(
     ("suffix", "modes"),
     [
@@ -330,6 +313,8 @@ def test_other_formats_are_decoded(tmp_path: Path, suffix: str, modes: str) -> N
         difference = np.abs(read.astype(int) - np.array(image.convert("RGB")))
         assert difference.max() <= (4 if lossless else 0)
         path.write_bytes(path.read_bytes()[: 700 if mode == "animated" else -40])
+        if suffix == ".avif":  # Pillow ignores a missing end
+            continue
         with pytest.raises(DataError, match=rf"image{suffix}: found no image that can be decoded"):
             read_rgb(path)
 
@@ -408,23 +393,3 @@ def test_truncated_files_are_named(tmp_path: Path, missing: slice, dtype: Any) -
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"image\.png: found no image that can be decoded"):
         read_pixels(path, indices=False)
-
-
-@pytest.mark.parametrize(
-    ("bits", "suffix"), [(10, ".png"), (12, ".tif"), (14, ".png"), (16, ".png")]
-)
-def test_colors_of_few_bits_are_warned_of_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], bits: int, suffix: str
-) -> None:
-    pixel_files._has_warned[0] = 0
-    for name in "ab":
-        path = tmp_path / f"{name}{suffix}"
-        write_pixels(path, np.full((4, 8, 3), 2**bits - 1, np.uint16))
-        read_rgb(path, as_stored=True)  # labels in colors
-        assert not (name == "a" and pixel_files.has_warned_of_range())
-        read_rgb(path)
-    printed = capsys.readouterr().err
-    assert printed.count("Warning: ") == (bits < 16)
-    assert (f"a{suffix}: the largest value of 16-bit colors is {2**bits - 1}," in printed) == (
-        bits < 16
-    )

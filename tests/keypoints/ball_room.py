@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair
@@ -27,7 +25,7 @@ def ball_panorama(name: str, pose: PanoramaPose, shape: tuple[int, int] = SHAPE)
     distance = -along + np.sqrt(along**2 + RADIUS_M**2 - pose.location_m @ pose.location_m)
     points = pose.points_m(directions, distance) / RADIUS_M
     rgb = np.repeat(volume_texture(points, (8, 16, 32))[..., None], 3, axis=-1)
-    return PairedPanorama(name, rgb, Path(f"{name}.png"), distance.astype(np.float32), pose)
+    return PairedPanorama(name, rgb, distance.astype(np.float32), pose)
 
 
 def ball_pair(name: str = "ball", shape: tuple[int, int] = SHAPE) -> PanoramaPair:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,21 +12,14 @@ import pytest
 import torch
 from torch import Tensor
 
-import tangent_train as tt
 from models import DepthAnything3
-from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import SettingError
-from tangent_train.inference.export import export_network
-from tangent_train.photo_networks import PhotoNetwork, import_network
 from tests.inference.test_many_views import (
-    SHAPE,
-    UNIT,
     Ball,
     many_view_network,
     predicted,
     true_distances,
 )
-from tests.inference.trained import sphere
 
 
 class StandIn(Ball):
@@ -73,24 +65,3 @@ def test_a_missing_package_is_explained(monkeypatch: pytest.MonkeyPatch) -> None
         DepthAnything3()
     with pytest.raises(SettingError, match="preset: found 'da3metric-large'; expected 'da3-small'"):
         DepthAnything3("da3metric-large")
-
-
-@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
-def test_a_network_of_the_package_is_imported_predicts_and_is_exported(tmp_path: Path) -> None:
-    """With random weights."""
-    pytest.importorskip("depth_anything_3")
-    torch.manual_seed(0)
-    settings = {"_target_": "models.DepthAnything3", "preset": "da3-small"}
-    module = DepthAnything3("da3-small")
-    photo_network = PhotoNetwork(module, settings, (), UNIT, (56, 56), depth_kind="relative_z")
-    loaded = import_network(photo_network, tmp_path / "net.ckpt")
-    assert (loaded.size_multiple, loaded.fixed_size) == (14, None)
-    network = tt.load(tmp_path / "net.ckpt", views="cubemap")
-    depth = network.depth(sphere(SHAPE[0]))
-    assert depth.shape == SHAPE
-    assert np.isfinite(depth).all()
-    export_network(loaded, tmp_path / "net.safetensors")
-    again = load_network(tmp_path / "net.safetensors").module.state_dict()
-    assert all(torch.equal(again[n], tensor) for n, tensor in module.state_dict().items())
-    with pytest.raises(SettingError, match="without their cameras"):
-        export_network(loaded, tmp_path / "net.onnx")

@@ -98,15 +98,15 @@ def test_other_prompts_and_threshold(tmp_path: Path) -> None:
     saved_clipseg(tmp_path)
     expected = networks.imported(tmp_path, prompts=PROMPTS, threshold=0.6)
     trained = networks.imported(tmp_path, prompts={"kite": ["kite"]})
-    changed = trained.prompted(prompts=PROMPTS, threshold=0.6)
+    changed = trained.prompted(PROMPTS, 0.6)
     assert changed.class_names == expected.class_names
     assert (changed.groups, changed.settings) == (expected.groups, expected.settings)
     images = _images(trained, 64)
     scores = changed.network(images)
     assert torch.equal(scores, expected.network(images))
-    networks.assert_same(trained.prompted(prompts="tah").network(images)[:, 0], scores[:, 1])
+    networks.assert_same(trained.prompted("tah").network(images)[:, 0], scores[:, 1])
     with pytest.raises(SettingError, match=r"prompts: .* expected a text"):
-        trained.prompted(prompts={"seat": []})
+        trained.prompted({"seat": []})
 
 
 def test_texts_of_classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +128,7 @@ def test_texts_of_classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_networks_without_text_are_refused(tmp_path: Path) -> None:
     networks.saved(networks.segformer, tmp_path)
     with pytest.raises(SettingError, match="a network without text"):
-        networks.imported(tmp_path).prompted(prompts=["mast"])
+        networks.imported(tmp_path).prompted(["mast"])
     networks.tokenizer(tmp_path)
     with pytest.raises(SettingError, match="found 'segformer'; expected 'clipseg' or 'sam3'"):
         networks.imported(tmp_path, prompts=PROMPTS)

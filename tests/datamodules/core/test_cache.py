@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from datamodules.core.cache import Cache
 from datamodules.core.files import ImageFiles
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from tangent_train.manifest import Shard
 from tests.conftest import fabricate
 
 
@@ -102,14 +101,11 @@ def test_samples_and_class_weights_are_those_without_a_cache(
     assert torch.equal(cached.class_weights("log"), plain.class_weights("log"))
 
 
-def test_shards_fill_a_cache_and_only_missing_files_are_decoded(
+def test_only_missing_files_are_decoded(
     root: Path, erp: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cache = tmp_path / "cache"
-    counts = [
-        Stanford2D3DS(root, erp, cache=cache).prepare(Shard(number, 3)) for number in (1, 2, 3)
-    ]
-    assert sum(counts) == 8
+    Stanford2D3DS(root, erp, cache=cache).prepare_data()
     sorted(cache.rglob("*.npy"))[0].unlink()
     decoded: list[str] = []
     read = Stanford2D3DS.read

@@ -19,7 +19,7 @@ from tests.tasks.small_networks import save_checkpoint
 
 NETWORKS = {path.stem for path in (config_folder() / "network").glob("*.yaml")}
 NETWORKS -= {"fcn_resnet_coco"}  # fcn_resnet with weights from the internet
-NETWORKS -= {"depth_anything_3"}  # of a package that is not installed
+NETWORKS -= {"depth_anything_3"}  # takes all views of a panorama
 NETWORKS -= {*PRIOR_METHODS, "zonal_classifier", "spherical_cnn"}
 OF_SHAPES = {"shape_classifier", "shape_classifier_16"}
 ALIKE = {"unet_small"}

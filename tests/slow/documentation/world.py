@@ -183,7 +183,7 @@ def run(words: list[str], variables: dict[str, str], world: Path) -> None:
     words = words_in_world(words, world)
     for name, _, value in (word.partition("=") for word in words):
         place = world / value
-        if name in ("output", "figure") and place != world:
+        if name == "output" and place != world:
             shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
     words += small_settings(words, world)
     before = _times(world)
