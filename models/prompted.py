@@ -83,7 +83,7 @@ class PromptedNetwork(nn.Module):
             tokenizer = Tokenizer.from_str(self.tokenizer.numpy(force=True).tobytes().decode())
             length = self.is_token.shape[1]
             tokenizer.enable_truncation(length)
-            tokenizer.enable_padding(**(tokenizer.padding | {"length": length}))
+            tokenizer.enable_padding(**{**(tokenizer.padding or {}), "length": length})
             tokens = tokenizer.encode_batch([text for of in prompts.values() for text in of])
             device = self.tokenizer.device
             ids = torch.tensor([of.ids for of in tokens], device=device)

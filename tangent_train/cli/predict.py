@@ -126,9 +126,8 @@ class _Prediction:
     """
 
     def __init__(self, settings: PredictSettings) -> None:
-        original = loaded = load_network(settings.checkpoint, settings.trust).prompted(
-            settings.prompts, settings.threshold
-        )
+        original = load_network(settings.checkpoint, settings.trust)
+        original = loaded = original.prompted(settings.prompts, settings.threshold)
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)

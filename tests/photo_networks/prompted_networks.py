@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,14 @@ SIZES: dict[str, Any] = {
 
 
 def _text(**more: Any) -> dict[str, Any]:
-    # Positions of the end token of `networks.tokenizer`.
-    return SIZES | {"vocab_size": 64, "max_position_embeddings": 16, "eos_token_id": 21} | more
+    return SIZES | {"vocab_size": 64, "max_position_embeddings": 16} | more
 
 
-def clipseg() -> networks.Made:
+def clipseg(end: int) -> networks.Made:
     hf = networks.transformers
     vision = SIZES | {"num_hidden_layers": 3, "image_size": 64, "patch_size": 16}
     config = hf.CLIPSegConfig(
-        text_config=_text(),
+        text_config=_text(eos_token_id=end),  # its state is the embedding
         vision_config=vision,
         projection_dim=8,
         extract_layers=[0, 1, 2],
@@ -60,8 +60,8 @@ def sam3() -> networks.Made:
 
 def saved_clipseg(folder: Path) -> Any:
     """Save a CLIPSeg with its tokenizer."""
-    network, _ = networks.saved(clipseg, folder)
-    networks.tokenizer(folder)
+    end = networks.tokenizer(folder).eos_token_id
+    network, _ = networks.saved(partial(clipseg, end), folder)
     return network
 
 

@@ -105,7 +105,7 @@ def test_other_prompts_and_threshold(tmp_path: Path) -> None:
     scores = changed.network(images)
     assert torch.equal(scores, expected.network(images))
     networks.assert_same(trained.prompted("tah").network(images)[:, 0], scores[:, 1])
-    with pytest.raises(SettingError, match=r"prompts: .* expected a text"):
+    with pytest.raises(ValueError, match="a text for each class"):
         trained.prompted({"seat": []})
 
 
