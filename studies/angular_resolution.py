@@ -10,8 +10,9 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from studies.output import COLORS, Row, save
+from studies.output import Row, save
 from tangent_train.geometry import TangentGrid, equirect_shape, vertex_resolution
+from tangent_train.results.chart import COLORS
 
 PAPER_DEG = {0: 90.0, 1: 45.0, 5: 2.812, 7: 0.703, 8: 0.352, 10: 0.088}
 """Degrees per pixel in the paper, by level."""

@@ -16,11 +16,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from datamodules.synthrooms.datamodule import RoomSettings, generate_rooms
-from studies.output import COLORS, Row, save
+from studies.output import Row, save
 from tangent_train.geometry import TangentGrid, lonlat_to_equirect
 from tangent_train.inference.views import images_of_side, wide_levels
 from tangent_train.io.palette import UNKNOWN_COLOR
 from tangent_train.rendering import equirect_to_tangent
+from tangent_train.results.chart import COLORS
 
 SIDES = (224, 256, 384, 512, 640, 768, 1024)
 """Sides of the images of common photo networks."""

@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from studies.output import COLORS, Row, save
+from studies.output import Row, save
+from tangent_train.results.chart import COLORS
 
 K1 = [k / 20 for k in range(11)]
 """Coefficients of the distortion in the paper's range, 0 to 0.5."""

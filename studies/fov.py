@@ -6,8 +6,9 @@ import math
 
 from matplotlib.figure import Figure
 
-from studies.output import COLORS, Row, save
+from studies.output import Row, save
 from tangent_train.geometry import TangentGrid
+from tangent_train.results.chart import COLORS
 
 PAPER_DEG = (73.1, 51.6, 31.5, 16.7, 8.4)
 """Fields of view in the paper's table, by base level, at level 10."""

@@ -15,12 +15,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from datamodules.synthrooms.datamodule import RoomSettings, SynthRooms, generate_rooms
-from studies.output import COLORS, Row, save
+from studies.output import Row, save
 from tangent_train.geometry import equirect_shape
 from tangent_train.heads import ClassesHead, DistanceHead
 from tangent_train.io.palette import class_colors
 from tangent_train.metrics.sphere import near_boundary
 from tangent_train.rendering import EquirectRepresentation
+from tangent_train.results.chart import COLORS
 
 MEASURES = ("miou_solid_angle", "boundary_miou", "pole_gap", "seam_gap", "seam_step")
 CAP_DEG, OFF_DEG, STRIP_DEG = 30, 0.5, 9

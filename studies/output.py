@@ -13,9 +13,6 @@ from tangent_train.results.tables import Table
 
 FOLDER = Path("figures")
 
-COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
-"""Colors of Okabe and Ito, which people with color blindness can distinguish."""
-
 Row = dict[str, Any]
 """A line of a table: values by column name."""
 

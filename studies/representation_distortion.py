@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial import SphericalVoronoi, cKDTree
 
-from studies.output import COLORS, Row, save
+from studies.output import Row, save
 from tangent_train.geometry import (
     CubeGrid,
     PinholeGrid,
@@ -25,6 +25,7 @@ from tangent_train.geometry import (
     equirect_latitudes,
     equirect_solid_angles,
 )
+from tangent_train.results.chart import COLORS
 
 Array = NDArray[np.float64]
 GRIDS: dict[str, PinholeGrid | None] = {

@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.output import COLORS, Row, save
+from studies.output import Row, save
 from tangent_train.geometry import icosphere
+from tangent_train.results.chart import COLORS
 
 SPHERES = ("of its mean radius", "vertices on it", "around the mesh")
 """Spheres for the comparison; the paper does not specify which it uses."""

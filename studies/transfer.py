@@ -8,7 +8,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from studies.output import COLORS
+from tangent_train.results.chart import COLORS
 
 DATA = Path(__file__).parents[1] / "docs" / "results" / "data"
 STAGES = {

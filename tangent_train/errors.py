@@ -29,6 +29,52 @@ _EXPECTED = {
 _SIMILAR = 0.7
 """Least similarity of a name that is suggested, from 0 to 1."""
 
+_ALIASES = {
+    alias: settings.split()
+    for aliases, settings in {
+        "checkpoint checkpoint_path ckpt ckpt_path load_from restore resume_from "
+        "resume_from_checkpoint resume": "resume init_from checkpoint weights file",
+        "init_from model_path pretrained weights": "init_from checkpoint weights",
+        "arch architecture backbone model model_name net": "network checkpoint model",
+        "data_dir data_path data_root dataset_path root root_dir": "data.root input",
+        "data datamodule dataset": "data input",
+        "dir folder image image_dir images img input input_dir source src": "input data.root",
+        "path": "input data.root file model",
+        "onnx": "file",
+        "hub name repo repo_id url": "model",
+        "azimuth heading": "yaw",
+        "elevation": "pitch",
+        "default_root_dir dst out out_dir output_dir output_path outputs save_dir save_path target "
+        "work_dir log_dir run_dir": "output hydra.run.dir",
+        "batch batch_size batchsize bs train_batch_size": "data.batch_size view_batch_size",
+        "n_workers num_worker num_workers workers": "data.num_workers",
+        "epoch epochs n_epochs num_epochs num_train_epochs": "trainer.max_epochs",
+        "iterations max_iters max_iterations num_steps steps": "trainer.max_steps",
+        "base_lr learning_rate lr lr0": "optimizer.lr",
+        "wd weight_decay": "optimizer.weight_decay",
+        "optim": "optimizer",
+        "lr_schedule lr_scheduler sched": "scheduler",
+        "device devices gpu gpu_ids gpus n_gpu n_gpus num_gpu num_gpus": "trainer.devices device",
+        "amp dtype fp16 half": "trainer.precision",
+        "grad_clip gradient_clip max_grad_norm": "trainer.gradient_clip_val",
+        "accumulate gradient_accumulation_steps": "trainer.accumulate_grad_batches",
+        "random_seed random_state seed_everything": "seed",
+        "height image_size img_size imgsz input_size level levels resolution width": "level levels "
+        "image_size size",
+        "config config_file exp": "experiment",
+        "exp_name experiment_name run_name": "name",
+        "loss_weights weight_classes": "task.head.class_weights",
+        "criterion loss loss_fn": "task.head.loss task.head",
+        "conf conf_thres confidence threshold": "min_confidence",
+        "projection representation view views": "views representation",
+        "tensorboard wandb": "logger",
+        "early_stop early_stopping patience": "callbacks",
+        "force": "overwrite",
+    }.items()
+    for alias in aliases.split()
+}
+"""Settings by their names in other frameworks and commands; those of the command are suggested."""
+
 
 def printable(text: str) -> str:
     r"""Escape terminal control sequences in lines of text.
@@ -113,18 +159,26 @@ class DataError(_ExplainedError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a remedy that names a known setting of a similar name, or nothing.
+    """Return a remedy that names known settings of the same meaning or spelling, or nothing.
 
     Args:
-        name: Name that is not known, e.g. ``levl`` or ``data.batchsize``.
+        name: Name that is not known, e.g. ``lr`` or ``data.batchsize``.
         known: Full names of known settings.
 
-    >>> nearest("levl", ["level", "seed"]), nearest("batchsize", ["data.batch_size"])
-    ('Did you mean level?', 'Did you mean data.batch_size?')
+    >>> nearest("levl", ["level", "seed"])
+    'Did you mean level?'
+    >>> nearest("ckpt_path", ["init_from", "optimizer.lr", "resume"])
+    'Did you mean resume or init_from?'
+    >>> nearest("learning_rate", ["init_from", "optimizer.lr"])
+    'Did you mean optimizer.lr?'
     """
-    ends = {one.rpartition(".")[2]: one for one in reversed([*known])}
-    found = get_close_matches(name.rpartition(".")[2].lower(), ends, 1, _SIMILAR)
-    return f"Did you mean {ends[found[0]]}?" if found else ""
+    last, known = name.rpartition(".")[2].lower(), [*known]
+    meant = [one for one in _ALIASES.get(last, ()) if one in known]
+    meant = meant or [one for one in known if one.rpartition(".")[2] == last]
+    meant = meant or get_close_matches(name, known, 1, _SIMILAR)
+    ends = {one.rpartition(".")[2]: one for one in reversed(known)}
+    meant = meant or [ends[one] for one in get_close_matches(last, ends, 1, _SIMILAR)]
+    return f"Did you mean {' or '.join(meant[:3])}?" if meant else ""
 
 
 def wrong_setting(error: Any, known: Iterable[str] = (), prefix: str = "") -> SettingError:
@@ -175,6 +229,12 @@ def at_least(name: str, value: object, least: int, most: int | None = None) -> i
         bounds = f"of {least} or more" if most is None else f"from {least} to {most}"
         raise SettingError(name, found=repr(value), expected=f"an integer {bounds}")
     return int(value)  # type: ignore[call-overload]
+
+
+def check_type(name: str, value: object, kinds: type | tuple[type, ...], expected: str) -> None:
+    """Raise TypeError unless an argument of the Python API is of one of some types."""
+    if not isinstance(value, kinds):
+        raise TypeError(f"{name}: found {type(value).__name__}; expected {expected}.")
 
 
 def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

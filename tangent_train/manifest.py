@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,6 +67,48 @@ class Shard:
         return items[self.number - 1 :: self.count]
 
 
+def check_only_results(folder: Path) -> None:
+    """Refuse an output folder with files that no command wrote.
+
+    Raises:
+        SettingError: The folder holds other files.
+    """
+    others = folder.iterdir() if folder.exists() and not (folder / MANIFEST).is_file() else ()
+    if any(other.name[0] != "." for other in others):
+        expected = "a new or empty folder, or one that this command began"
+        found = f"{folder}, which holds other files"
+        raise SettingError("output", found=found, expected=expected)
+
+
+def check_continues(folder: Path, settings: Mapping[str, Any], ignored: Collection[str]) -> None:
+    """Refuse an output folder that `Manifest.open` would refuse, before the work is prepared.
+
+    Args:
+        folder: Output folder.
+        settings: Settings of the command, plain values.
+        ignored: Names of settings that are stored otherwise, or not known yet.
+
+    Raises:
+        SettingError: The folder holds other files, or items finished with other settings.
+    """
+    check_only_results(folder)
+    if _finished(folder):
+        before = json.loads((folder / MANIFEST).read_bytes())
+        wanted = json.loads(json.dumps(settings))
+        _check_same(folder, wanted, before, before.keys() & wanted.keys() - {*ignored})
+
+
+def _check_same(
+    folder: Path, wanted: Mapping[str, Any], before: Mapping[str, Any], names: Iterable[str]
+) -> None:
+    for name in sorted(names):
+        found, old = ("null" if s.get(name) is None else s[name] for s in (wanted, before))
+        if found != old:
+            remedy = "Choose another output, or delete this one to write it again."
+            expected = f"{old}, with which {folder} was written"
+            raise SettingError(name, found=found, expected=expected, remedy=remedy)
+
+
 def _finished(folder: Path) -> dict[str, dict[str, Any]]:
     """Return the entries of the finished items of all shards by name."""
     finished: dict[str, dict[str, Any]] = {}
@@ -115,11 +157,7 @@ class Manifest:
         """
         path = folder / MANIFEST
         wanted = json.loads(json.dumps(settings))  # tuples become lists, as in the file
-        others = folder.iterdir() if folder.exists() and not path.is_file() else ()
-        if any(other.name[0] != "." for other in others):
-            expected = "a new or empty folder, or one that this command began"
-            found = f"{folder}, which holds other files"
-            raise SettingError("output", found=found, expected=expected)
+        check_only_results(folder)
         finished = _finished(folder)
         shard = shard or Shard()
         if not (finished or is_shared or shard.count > 1):
@@ -128,12 +166,7 @@ class Manifest:
         with suppress(FileExistsError), path.open("x", encoding="utf-8") as new:
             new.write(json.dumps(wanted, indent=1) + "\n")
         before = json.loads(path.read_bytes())
-        for name in sorted(before.keys() | wanted.keys()):
-            found, old = ("null" if s.get(name) is None else s[name] for s in (wanted, before))
-            if found != old:
-                remedy = "Choose another output, or delete this one to write it again."
-                expected = f"{old}, with which {folder} was written"
-                raise SettingError(name, found=found, expected=expected, remedy=remedy)
+        _check_same(folder, wanted, before, before.keys() | wanted.keys())
         return cls(folder, finished, shard)
 
     def missing(self, names: Iterable[str]) -> list[str]:

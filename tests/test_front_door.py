@@ -13,9 +13,7 @@ import pytest
 
 import tangent_train
 from tangent_train.errors import SettingError
-from tangent_train.geometry import CubeGrid
 from tangent_train.geometry.sphere import check_area
-from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tests.running import run_python
 
 
@@ -68,12 +66,23 @@ def _imported(folder: Path, command: str, *arguments: str, names: tuple[str, ...
     [
         ("train", ("--help",)),
         ("render", ("--help",)),
+        ("render", ("input=missing.jpg", "output=out")),
+        ("render", ("input=pano.png", "output=held")),
+        ("render", ("input=pano.png", "output=done", "views=cubemap")),
         ("predict", ("checkpoint=missing.ckpt", "input=pano.png", "output=out")),
+        ("predict", ("checkpoint=net.ckpt", "input=missing.jpg", "output=out")),
+        ("predict", ("checkpoint=net.ckpt", "input=pano.png", "output=held")),
+        ("export", ("checkpoint=net.ckpt", "output=pano.png")),
+        ("train", ("init_from=missing.ckpt",)),
     ],
 )
-def test_help_and_refused_settings_import_nothing_heavy(
+def test_help_and_refused_paths_import_nothing_heavy(
     tmp_path: Path, command: str, arguments: tuple[str, ...]
 ) -> None:
+    for name in ("pano.png", "net.ckpt", "held/notes.txt", "done/finished.jsonl"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text('{"item": "pano"}')
+    (tmp_path / "done" / "manifest.json").write_text('{"views": "horizontal"}')
     assert _imported(tmp_path, command, *arguments, names=_HEAVY) == set()
 
 
@@ -105,6 +114,50 @@ RINGS = [{"pitch": 0, "views": 8}]
 PANORAMA = np.zeros((16, 32), np.uint8)
 
 
+@pytest.mark.parametrize("wrong", [[[0, 1]], "room.jpg", 5, None], ids=str)
+def test_arguments_of_other_types_are_named(wrong: Any) -> None:
+    size, tt = (16, 32), UNTYPED
+    calls: dict[str, Any] = {
+        "panorama": lambda: tt.equirect_to_tangent(wrong, GRID),
+        "grid": lambda: tt.equirect_to_tangent(PANORAMA, wrong),
+        "tangent images": lambda: tt.tangent_to_equirect(wrong, GRID, size),
+        "scores": lambda: tt.tangent_to_labels(wrong, GRID, size),
+        "function": lambda: tt.apply(wrong, PANORAMA, GRID),
+        "path": lambda: tt.load(5 if wrong == "room.jpg" else wrong),
+    }
+    for name, call in calls.items():
+        with pytest.raises(TypeError, match=f"^{name}: found [A-Za-z]+; expected "):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        *(({"rings": None}, "rings"), ({"rings": [8]}, "ring"), ({"rings": "horizontal"}, "ring")),
+        ({"rings": [{"pitch": "0", "views": 8}]}, "pitch"),
+        *(({"fov_deg": ("90", 90)}, "fov"), ({"valid": [[True]]}, "valid")),
+    ],
+)
+def test_arguments_of_rings_of_other_types_are_named(given: dict[str, Any], name: str) -> None:
+    whole = {"rings": RINGS, "fov_deg": (90, 90), "size": SIZE}
+    with pytest.raises(TypeError, match=f"^{name}: found [A-Za-z]+; expected "):
+        UNTYPED.RingGrid(**whole | given)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        *({"view_batch_size": -1}, {"view_batch_size": 0}, {"rotations": 0}),
+        *({"views": 5}, {"levels": "x"}, {"rotations": "x"}, {"device": 5.5}, {"base_level": [0]}),
+    ],
+    ids=str,
+)
+def test_settings_of_other_types_are_named(given: dict[str, Any]) -> None:
+    (name,) = given
+    with pytest.raises(SettingError, match=rf"^{name}: found .*; expected (a valid|greater) "):
+        UNTYPED.load("missing.ckpt", **given)
+
+
 @pytest.mark.parametrize("area", [5, "abcd", [0, 90], [0, "a", 0, 90]], ids=str)
 def test_an_area_of_another_type_is_named(area: Any) -> None:
     with pytest.raises(SettingError, match=r"^area: found \["):
@@ -120,19 +173,13 @@ def test_an_area_of_another_type_is_named(area: Any) -> None:
         ),
         (lambda: tangent_train.RingGrid([], (90, 90), SIZE), "number of rings: found 0; "),
         (lambda: UNTYPED.RingGrid([{"pitch": 0}], (90, 90), SIZE), "views: found None; "),
-        (lambda: UNTYPED.RingGrid(RINGS, 90, SIZE), "fov_deg: found 90; expected two numbers"),
         (lambda: UNTYPED.RingGrid(RINGS, (90, 90), 32), "size: found 32; expected two numbers"),
-        (lambda: tangent_train.RingGrid(RINGS, (90, 90), (32, 0)), "columns of an image: found 0"),
-        (lambda: CubeGrid(8, margin=UNTYPED), "margin: found <module"),
         (lambda: UNTYPED.perspective(PANORAMA, {}, 0, 90, 8), "yaw, pitch and roll: found {}, 0"),
+        (lambda: tangent_train.apply(np.mean, PANORAMA, GRID, images_per_call=0), "images_per_ca"),
         (lambda: tangent_train.TangentGrid(9, 12), "base_level: found 9; .* from 0 to 8"),
         (lambda: tangent_train.TangentGrid(-1, 4), "base_level: found -1; "),
-        (lambda: UNTYPED.TangentGrid(0, 4.5), "level: found 4.5; expected an integer"),
-        (lambda: UNTYPED.TangentGrid(0, 4, "16"), "dim: found '16'; expected an integer"),
         (lambda: tangent_train.TangentGrid(0, 4, rotation=5), "rotation: found 5.0; "),
         (lambda: tangent_train.equirect_to_tangent(PANORAMA, GRID, [20]), "faces: .*, 0 to 19"),
-        (lambda: TangentRepresentation(0, 15), "level: found 15; .* from 0 to 14"),
-        (lambda: EquirectRepresentation(4, erp_height=10**6), "erp_height: found 1000000; "),
     ],
 )
 def test_sizes_and_indices_out_of_range_are_refused(build: Any, message: str) -> None:

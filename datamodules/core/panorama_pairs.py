@@ -16,7 +16,13 @@ from datamodules.core.data_module import print_on_rank_zero
 from datamodules.core.files import ImageFiles
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PanoramaPose
-from tangent_train.io.gpano import PanoramaArea, check_resolution, read_area
+from tangent_train.io.gpano import (
+    PanoramaArea,
+    check_resolution,
+    read_area,
+    read_tags,
+    refuse_stereo,
+)
 from tangent_train.io.image_files import image_paths, short_names
 from tangent_train.io.pixel_files import read_rgb
 from tangent_train.rendering.resampling import resize
@@ -168,6 +174,7 @@ class ImagePairs(PanoramaPairs):
     def panorama(self, files: ImageFiles) -> PairedPanorama:
         """See `PanoramaPairs`; a partial panorama repeats its edges elsewhere."""
         rgb = read_rgb(files.rgb)
+        refuse_stereo(files.rgb, read_tags(files.rgb))
         area = read_area(files.rgb, (rgb.shape[0], rgb.shape[1]))
         whole = area.filled(area.place(rgb), "edge")
         return PairedPanorama(files.name, whole, valid=area.valid)

@@ -6,11 +6,13 @@ import sys
 from contextlib import redirect_stdout
 
 from datamodules.core.label_map import label_doubts
+from tangent_train.cli import main
 from tangent_train.cli.run import open_data
 from tangent_train.cli.scored_files import check_files
 from tangent_train.config.settings import FilesSettings
 from tangent_train.console import print_text
 from tangent_train.errors import counted
+from tangent_train.io.pixel_files import has_warned_of_range
 from tangent_train.results.tables import Table, percent
 
 
@@ -45,6 +47,7 @@ def check(settings: FilesSettings) -> None:
         for split, counts in labeled.items()
         for doubt in label_doubts(split, counts, data.label_names)
     ]
+    warnings += ["16-bit colors of few bits, which are named above"] * has_warned_of_range()
     with redirect_stdout(sys.stdout if terminal else sys.stderr):
         if labeled:
             shares = [[percent(share) for share in n / n.sum()] for n in labeled.values()]
@@ -59,3 +62,7 @@ def check(settings: FilesSettings) -> None:
     print_text(f"{summary}; {checked}.", error=bool(listed or warnings) and not terminal)
     if listed:
         sys.exit(1)
+
+
+if __name__ == "__main__":
+    main.check()

@@ -14,6 +14,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from datamodules.core.label_map import PANOPTIC
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
+from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
 from tangent_train.cli.scored_files import score_files
 from tangent_train.config.build import build_from_config
@@ -131,3 +132,7 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
         data = {**data, "inputs": list(loaded.inputs), "normalization": normalization}
     network = loaded.settings
     return {"level": level, "representation": section, "data": data, "network": network}
+
+
+if __name__ == "__main__":
+    main.evaluate()

@@ -6,6 +6,7 @@ from rich import get_console
 from rich.text import Text
 
 from tangent_train.checkpoints.loaded import load_network
+from tangent_train.cli import main
 from tangent_train.config.settings import ExportSettings
 from tangent_train.console import print_text
 from tangent_train.errors import printable, width_height
@@ -37,3 +38,7 @@ def export(settings: ExportSettings) -> None:
         f"images: {loaded.in_channels} channels, {sides}; {scores}\n"
         f"largest difference from PyTorch: {written.difference:.1e} of the range of the {of_what}"
     )
+
+
+if __name__ == "__main__":
+    main.export()

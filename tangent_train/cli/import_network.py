@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich import get_console
 from rich.text import Text
 
+from tangent_train.cli import main
 from tangent_train.config.settings import ImportSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, listed, printable, width_height
@@ -121,3 +122,7 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
             *[trust] * bool(trained.trust),
         ]
     )
+
+
+if __name__ == "__main__":
+    main.import_network()

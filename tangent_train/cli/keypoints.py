@@ -10,6 +10,7 @@ from typing import Any
 from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPairs
+from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import KeypointSettings
 from tangent_train.console import print_text
@@ -82,3 +83,7 @@ def file_name(name: str) -> str:
     'hall_a_hall_b'
     """
     return re.sub(r"[^\w.-]+", "_", name).strip("_.")[:80] or "pair"
+
+
+if __name__ == "__main__":
+    main.keypoints()

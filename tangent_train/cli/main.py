@@ -7,6 +7,7 @@ misspelled override return immediately.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
@@ -14,6 +15,7 @@ from functools import partial
 from importlib import import_module
 from io import StringIO
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 from tangent_train.errors import DataError, SettingError, printable
@@ -32,16 +34,36 @@ def _errors_as_messages(command: str) -> Iterator[None]:
 
         message = explained(error, command) or " ".join(str(error).split())
         sys.exit(printable(f"tangent-{command}: {message}"))
-    except (DataError, SettingError, MemoryError, OSError) as error:
+    except MemoryError as error:
+        remedy = "Choose smaller images or fewer at once."
+        sys.exit(f"tangent-{command}: not enough memory. {error}. {remedy}")
+    except (DataError, SettingError, OSError) as error:
         sys.exit(printable(f"tangent-{command}: {error}"))
     except Exception as error:
-        # Of Lightning, and of Hydra for data=5.
-        text, is_known = str(error), type(error).__name__ == "MisconfigurationException"
-        if not is_known and "group override" not in text:
+        # Of Hydra for data=5, of Optuna if all runs fail, of Lightning.
+        text, kind = " ".join(str(error).split()), type(error).__name__
+        known = kind == "ValueError" and re.search("group override|No trials are completed", text)
+        if not known and kind != "MisconfigurationException":
             raise
         sys.exit(printable(f"tangent-{command}: {text}"))
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+@contextmanager
+def _unused_folder_removed(command: str) -> Iterator[None]:
+    """Remove the run folder of a refused command, if it has only Hydra's files and the log."""
+    from hydra.core.hydra_config import HydraConfig
+
+    try:
+        yield
+    except (DataError, SettingError):
+        config = HydraConfig.get()
+        folder = Path(config.runtime.output_dir)
+        names = {path.name for path in folder.iterdir()} - {f"{command}.log"}
+        if names == {".hydra"} and "run.dir=" not in str(config.overrides.hydra):
+            rmtree(folder)
+        raise
 
 
 def _run(command: str, settings: Any) -> Any:
@@ -64,14 +86,9 @@ def _main(command: str) -> None:
     import hydra
 
     from tangent_train.cli.processes import OF_SWEEPS, in_sweep, run_job
+    from tangent_train.config.command_line import check_words, with_help
     from tangent_train.config.help import annotate, listed_by_files
-    from tangent_train.config.settings import (
-        SETTINGS,
-        config_name,
-        missing_groups,
-        refuse_typed,
-        validate,
-    )
+    from tangent_train.config.settings import config_name, missing_groups, refuse_typed, validate
     from tangent_train.files import config_folder
 
     def job(config: Any) -> Any:
@@ -79,14 +96,16 @@ def _main(command: str) -> None:
         if in_sweep() and not missing:  # outside the block: the other jobs go on
             return run_job(command)
         # Inside: Hydra prints a line for other exceptions.
-        with _errors_as_messages(command):
+        with _errors_as_messages(command), _unused_folder_removed(command):
             refuse_typed(OF_SWEEPS, f"a sweep: tangent-{command} -m …")
-            unread = f"no such setting: tangent-{command} does not read it"
-            refuse_typed(SETTINGS[command].not_read, unread)
-            return _run(command, validate(command, config, missing))
+            settings = validate(command, config, missing)
+            import_module("tangent_train.cli.paths").check_paths(settings)
+            return _run(command, settings)
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors are raised here, not printed by Hydra
     with _errors_as_messages(command):
+        sys.argv[1:] = with_help(sys.argv[1:])
+        check_words(command, sys.argv[1:])
         name = config_name(command, sys.argv[1:])
         run = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)
         if {"--help", "-h"}.isdisjoint(sys.argv):
@@ -107,12 +126,25 @@ def _print_version(command: str) -> None:
 
 
 def report() -> None:
-    """Run ``tangent-report <run folders>``: write tables over runs."""
+    """Run ``tangent-report <run folders>``: write tables and a chart over runs."""
     _print_version("report")
     from tangent_train.cli.report import report as write_report
+    from tangent_train.config.command_line import with_help
 
     with _errors_as_messages("report"):
-        write_report(sys.argv[1:])
+        write_report(with_help(sys.argv[1:]))
+
+
+def overview() -> None:
+    """Print the commands of the package, for ``python -m tangent_train``."""
+    _print_version("train")
+    from tangent_train.config.help import description
+    from tangent_train.files import config_folder
+
+    files = [path for path in sorted(config_folder().glob("*.yaml")) if path.stem != "run"]
+    lines = [description(path)[0] for path in files]
+    lines.append("tangent-report compares finished runs, also with published scores.\n")
+    sys.stdout.write("\n".join([*lines, "--help explains the settings of a command.\n"]))
 
 
 train = partial(_main, "train")
@@ -125,3 +157,6 @@ render = partial(_main, "render")
 export = partial(_main, "export")
 import_network = partial(_main, "import")
 keypoints = partial(_main, "keypoints")
+
+if __name__ == "__main__":
+    overview()

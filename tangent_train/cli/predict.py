@@ -15,6 +15,7 @@ import numpy as np
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.folder.class_masks import mask_reader
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
+from tangent_train.cli import main
 from tangent_train.cli.one_scale import OneScale
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
@@ -39,7 +40,7 @@ def predict(settings: PredictSettings) -> None:
         DataError: The checkpoint cannot be read, or no images are found.
     """
     shard = Shard.parse(settings.shard)
-    inputs = Inputs.find(settings.input, settings.every)
+    inputs = Inputs.find(settings.input, settings.every, settings.eye, settings.area)
     prediction = _Prediction(settings)
     folder, names = prediction.folder, inputs.names
     content = settings.model_dump(mode="json", exclude={*settings.not_content})
@@ -165,13 +166,11 @@ class _Prediction:
         on_device = settings.device, settings.view_batch_size, settings.compile
         self._predictor = Predictor(loaded, head, views, *on_device)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
-        self._depth = None
-        if "depth" in loaded.inputs:
-            if settings.depth is None:
-                expected = "a folder of depth images, which the network takes"
-                raise SettingError("depth", found="null", expected=expected)
-            of_file = settings.depth_scale, settings.depth_channel
-            self._depth = images.DepthFolder(settings.depth, *of_file)
+        if "depth" in loaded.inputs and settings.depth is None:
+            expected = "a folder of depth images, which the network takes"
+            raise SettingError("depth", found="null", expected=expected)
+        of_file = settings.depth_scale, settings.depth_channel
+        self._depth = images.DepthFolder(settings.depth, *of_file) if settings.depth else None
 
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""
@@ -180,7 +179,7 @@ class _Prediction:
         depth = None if self._depth is None else partial(self._depth.read, stem)
         if settings.projection == "perspective":
             return images.read_photo(image, settings.fov, depth)
-        return images.read_panorama(image, settings.area, settings.upright, depth)
+        return images.read_panorama(image, settings.area, settings.upright, depth, settings.eye)
 
     def _upright(self, image: images.InputImage) -> images.InputImage:
         if self._settings.upright != "auto":
@@ -230,6 +229,8 @@ class _Prediction:
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         entry |= job.place
+        if self._settings.eye:
+            entry["eye"] = self._settings.eye
         if share := facts.get("not_finite"):
             entry["not_finite"] = float(f"{share:.4g}")
         return entry | self._head.entry(predicted, is_counted)
@@ -254,13 +255,16 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
     names |= {"levels", "base_level", "blend", "write", "report", "shard", "prompts", "threshold"}
     names |= {"view_batch_size", "compile", "device", "trust"}
-    panoramas = {"area", "fill", "views", "upright", "mask", "rotations"}
+    panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
     if loaded.predicts == DISTANCE:
         panoramas |= {"align_across"}
     panoramas |= {"mask_classes"} if settings.mask is not None else set()
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()
-    return names | (
-        {"depth", "depth_scale", "depth_channel"} if "depth" in loaded.inputs else set()
-    )
+    takes_depth = "depth" in loaded.inputs or loaded.things
+    return names | ({"depth", "depth_scale", "depth_channel"} if takes_depth else set())
+
+
+if __name__ == "__main__":
+    main.predict()

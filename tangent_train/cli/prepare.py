@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tangent_train.cli import main
 from tangent_train.cli.run import open_data
 from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text
@@ -17,3 +18,7 @@ def prepare(settings: RunSettings) -> None:
     data.prepare_data()
     counts = ", ".join(f"{len(files)} {split}" for split, files in data.splits().items())
     print_text(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
+
+
+if __name__ == "__main__":
+    main.prepare()

@@ -9,11 +9,14 @@ import sys
 import sysconfig
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
 from tangent_train.config.settings import typed_settings
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import quoted
 
@@ -22,6 +25,23 @@ OF_SWEEPS = ("launcher", "sweep")
 
 OBJECTIVE_FILE = "validation.json"
 """File in a run's folder with the validation score of its best epoch."""
+
+
+class SweepSummary(Callback):
+    """Prints the scores of the runs of a sweep when it has ended, whoever has launched them."""
+
+    def on_multirun_end(self, config: Any, **_: Any) -> None:
+        """Print a line per run."""
+        folder = Path(config.hydra.sweep.dir)
+        for file in sorted(folder.rglob("results.json")):
+            content = json.loads(file.read_bytes())
+            name, best = next(iter(content["scores"])), file.with_name(OBJECTIVE_FILE)
+            scores = [f"{name} {content['scores'][name]:.4g}"]
+            if best.is_file():
+                validation = json.loads(best.read_bytes())
+                scores.append(f"{validation['figure']} {validation['best']:.4g}")
+            print_text(f"{file.parent}: {', '.join(scores)}")
+        print_text(f"A table of the settings: tangent-report {folder}")
 
 
 def in_sweep() -> bool:

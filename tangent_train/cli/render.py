@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from datamodules.folder.class_masks import mask_reader
+from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
@@ -38,7 +39,7 @@ from tangent_train.io.camera_files import (
     write_poses,
     write_rig,
 )
-from tangent_train.io.gpano import read_area, read_tags
+from tangent_train.io.gpano import eye_part, read_area, read_tags, shape_of
 from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.jobs import Inputs, Job, work_on
 from tangent_train.io.nerfstudio import write_transforms, write_z_depth
@@ -81,7 +82,7 @@ def render(settings: RenderSettings) -> None:
 
 def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     """Render panoramas to folders of tangent images, or to one project for COLMAP."""
-    inputs = Inputs.find(settings.input or "", settings.every)
+    inputs = Inputs.find(settings.input or "", settings.every, settings.eye, settings.area)
     output, kind, suffix = settings.output, settings.interpolation, f".{settings.format}"
     if kind == "nearest" and suffix in LOSSY_SUFFIXES:
         expected = "png, tif or npy with interpolation=nearest: other formats change pixels"
@@ -100,7 +101,7 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     manifest = Manifest.open(output, content)
 
     def work(job: Job, progress: Callable[[float], object]) -> None:
-        source = job.path, kind, settings.area, job.value, settings.depth_channel
+        source = job.path, kind, settings.area, job.value, settings.depth_channel, settings.eye
         image, area = read_placed(*source)
         shape = image.shape[0], image.shape[1]
         if is_project:
@@ -233,6 +234,8 @@ def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
         with suppress(DataError, SettingError):
             tags = read_video_tags(path) if path in sizes else read_tags(path)
             size = sizes.get(path) or read_image_size(path)
+            if path not in sizes:
+                size = shape_of(size, eye_part(path, size, settings.eye, area, tags))
             rows.append(read_area(path, size, area, tags=tags).full_shape[0])
     return max(rows, default=512)
 
@@ -294,7 +297,7 @@ _DIRECTIONS = ("yaw", "pitch", "roll", "fov", "size")
 _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set[str]]] = {
     "input": (
         _render_views,
-        {"every", "area", "views", "base_level", "level", "dim", "faces", "rotation"}
+        {"every", "area", "eye", "views", "base_level", "level", "dim", "faces", "rotation"}
         | {*_DIRECTIONS, "format"}
         | {"interpolation", "colmap", "nerfstudio", "depth_channel"},
     ),
@@ -308,3 +311,6 @@ _OF_NERFSTUDIO = {"poses", "cameras", "depth", "depth_scale"}
 """Settings that are read with colmap=true or nerfstudio=true, and with the latter only."""
 
 _SEPARATE = "tangent_train.rendering.representations.pinhole.SeparateViews"
+
+if __name__ == "__main__":
+    main.render()

@@ -6,11 +6,12 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from tangent_train.cli import main
 from tangent_train.console import print_text
 
 
 def report(arguments: Sequence[str]) -> None:
-    """Read runs, print the table, and write ``report.md`` and ``.csv``.
+    """Read runs, print the table, and write ``report.md``, ``.csv`` and ``.png``.
 
     Args:
         arguments: Command line after the program's name.
@@ -26,7 +27,7 @@ def report(arguments: Sequence[str]) -> None:
     )
     of_folders = "folders of runs, or folders with runs below them"
     parser.add_argument("folders", nargs="+", type=Path, help=of_folders)
-    of_output = "folder for report.md and report.csv (default: report)"
+    of_output = "folder for report.md, report.csv and report.png (default: report)"
     parser.add_argument("--output", type=Path, default=Path("report"), help=of_output)
     options = parser.parse_args(arguments)
     # Slow imports, not needed to refuse a command line.
@@ -39,3 +40,7 @@ def report(arguments: Sequence[str]) -> None:
     runs.write(options.output, "report")
     runs.print()
     print_text(f"Files: {options.output}/report.*")
+
+
+if __name__ == "__main__":
+    main.report()

@@ -14,8 +14,11 @@ import numpy as np
 import yaml  # type: ignore[import-untyped]
 from hydra.utils import get_class
 from lightning.pytorch.callbacks import (
+    BatchSizeFinder,
     Callback,
+    LearningRateFinder,
     LearningRateMonitor,
+    StochasticWeightAveraging,
 )
 from lightning.pytorch.callbacks import ProgressBar as LightningProgressBar
 from lightning.pytorch.utilities import rank_zero_only
@@ -51,6 +54,13 @@ from tangent_train.tasks.optimization import Schedule
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
 
+_REFUSED = {
+    LearningRateFinder: "Compare rates with a sweep: -m optimizer.lr=1e-3,1e-2",
+    BatchSizeFinder: "Try values of data.batch_size with debug=fast.",
+    StochasticWeightAveraging: "For an average of the weights: ema=0.999",
+}
+"""Callbacks of Lightning that change a training behind its settings."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -76,12 +86,12 @@ class Run:
 
     def trainer(self, callbacks: Sequence[Callback] = ()) -> lightning.Trainer:
         """Build the trainer of the config, with further callbacks, and log the settings."""
-        settings = self.settings
+        settings, resumed = self.settings, getattr(self.settings, "resume", None)
         loggers = start_loggers(
             None if settings.trainer.get("fast_dev_run") else settings.logger,
             self.folder,
             evaluation.flat_settings(settings.model_dump(mode="json")),
-            is_resumed=getattr(settings, "resume", None) is not None,
+            resumed and self.folder / "checkpoints" / "last.ckpt",
         )
         panels = self.folder / "panels", settings.panels, settings.validation_images
         given = build_callbacks(settings, self.task)
@@ -303,4 +313,7 @@ def build_callbacks(settings: RunSettings, task: Any) -> list[Any]:
         monitor = section.get("monitor") or task.monitor
         known = {"monitor": monitor, "mode": task.head.mode_of(monitor)}
         built.append(build_from_config(filled(section, known), f"callbacks.{name}"))
+        if remedy := _REFUSED.get(type(built[-1])):
+            found, expected = type(built[-1]).__name__, "a callback that can be resumed and tested"
+            raise SettingError(f"callbacks.{name}", found=found, expected=expected, remedy=remedy)
     return built

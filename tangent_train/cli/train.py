@@ -18,6 +18,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
+from tangent_train.cli import main
 from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
 from tangent_train.cli.processes import OBJECTIVE_FILE
 from tangent_train.cli.run import Run, build
@@ -134,3 +135,7 @@ def _best_validation_score(
         content = {"figure": best.monitor, "best": score, "mode": best.mode}
         write_text(folder / OBJECTIVE_FILE, json.dumps(content) + "\n")
     return score
+
+
+if __name__ == "__main__":
+    main.train()

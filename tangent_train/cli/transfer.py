@@ -34,6 +34,7 @@ from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.checkpoints.outputs import network_for_views
+from tangent_train.cli import main
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.run import build_data
 from tangent_train.config.settings import SETTINGS, typed_names, typed_settings, validate
@@ -285,7 +286,7 @@ def _run(stage: Stage, settings: Mapping[str, Any], manifest: Manifest, heading:
 
 
 def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
-    """Write and print the tables."""
+    """Write and print the tables and the chart."""
     results: dict[Any, list[Any]] = defaultdict(list)
     for stage in stages:
         key = stage.changes["level"] if config.study_levels and stage.view else stage.name
@@ -298,4 +299,8 @@ def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
         name, report = "transfer", transfer_report(results, cells)
     report.write(folder, name)
     report.print()
-    print_text(f"Tables: {folder / name}.md, .csv")
+    print_text(f"Tables and a chart: {folder / name}.md, .csv, .png")
+
+
+if __name__ == "__main__":
+    main.transfer()

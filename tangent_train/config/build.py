@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, wraps
 from inspect import signature
-from typing import Any, get_type_hints
+from typing import Any, ParamSpec, TypeVar, get_type_hints
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -17,6 +17,9 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
 from tangent_train.errors import DataError, SettingError, wrong_setting
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 _CHECKED = ("lightning.", "torch.optim.", "tangent_train.tasks.")
 """Modules whose annotations are checked, and whose errors are explained: those of trainers,
@@ -67,8 +70,10 @@ def _explained(place: str, target: str) -> Iterator[None]:
         raise SettingError(place, found=found, expected="settings that it accepts") from error
 
 
-def check_types(function: Callable[..., Any], values: Mapping[str, Any], prefix: str) -> None:
-    """Check arguments, other than None, by the types that a function declares.
+def check_types(
+    function: Callable[..., Any], values: Mapping[str, Any], prefix: str = ""
+) -> dict[str, Any]:
+    """Return arguments as the types that a function declares, other than None.
 
     Args:
         function: Function or class.
@@ -84,15 +89,27 @@ def check_types(function: Callable[..., Any], values: Mapping[str, Any], prefix:
             called.__init__ if isinstance(function, type) else called, include_extras=True
         )
     except NameError:  # names that are imported for type checkers only
-        return
+        return {**values}
     kinds = {name: hints[name] for name, v in values.items() if name in hints and v is not None}
     make: Any = TypedDict
     arguments = make("arguments", kinds)
     arguments.__pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
     try:
-        TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
+        typed = TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
     except ValidationError as error:
         raise wrong_setting(error, prefix=prefix) from error
+    return {**values, **typed}
+
+
+def checks_types(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Decorate a function whose arguments by name are checked with `check_types`."""
+
+    @wraps(function)
+    def checked(*values: _Arguments.args, **named: _Arguments.kwargs) -> _Result:
+        typed: Any = check_types(function, named)
+        return function(*values, **typed)
+
+    return checked
 
 
 def filled(section: Any, known: Mapping[str, Any]) -> Any:

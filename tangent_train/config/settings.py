@@ -132,6 +132,9 @@ class ImageSettings(Settings):
     area: tuple[float, float, float, float] | None = None
     """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
     sphere"""
+    eye: Literal["left", "right"] | None = None
+    """stereo panoramas (two pictures above or beside each other): left | right; null = not
+    stereo"""
 
 
 class PredictSettings(PromptSettings, ImageSettings, NetworkSettings):
@@ -147,7 +150,8 @@ class PredictSettings(PromptSettings, ImageSettings, NetworkSettings):
     fov: FieldOfView | None = None
     """photos: horizontal field of view in degrees; null = from EXIF"""
     depth: ExistingPath | None = None
-    """folder of depth images named as the inputs, for networks that need depth"""
+    """folder of depth images named as the inputs, e.g. depth/ of another prediction: for networks
+    that need depth, and for the distances of objects"""
     depth_scale: PositiveFloat = 1000
     """units per meter in depth files of whole numbers, read and written"""
     depth_channel: str | None = None

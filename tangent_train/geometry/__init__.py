@@ -18,6 +18,7 @@ from tangent_train.geometry.camera import camera_matrix_from_fov as camera_matri
 from tangent_train.geometry.camera import is_camera_matrix as is_camera_matrix
 from tangent_train.geometry.camera import lengths_of_rays as lengths_of_rays
 from tangent_train.geometry.camera import perspective_directions as perspective_directions
+from tangent_train.geometry.camera import pixel_solid_angles as pixel_solid_angles
 from tangent_train.geometry.camera import ray_lengths as ray_lengths
 from tangent_train.geometry.camera import shift_range as shift_range
 from tangent_train.geometry.grids import CubeGrid as CubeGrid

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tangent_train.errors import SettingError
-from tangent_train.geometry.sphere import Floats
+from tangent_train.errors import SettingError, check_type
+from tangent_train.geometry.sphere import Floats, equirect_solid_angles
 
 
 def half_width(fov_deg: float) -> float:
@@ -17,6 +18,7 @@ def half_width(fov_deg: float) -> float:
     Raises:
         SettingError: The field of view is not between 0° and 180°.
     """
+    check_type("fov", fov_deg, Real, "degrees")
     if not 0 < fov_deg < 180:
         raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")
     return math.tan(math.radians(fov_deg) / 2)
@@ -78,6 +80,22 @@ def ray_lengths(camera_matrix: Floats, size: tuple[int, ...]) -> Floats:
         for axis in (0, 1)
     )
     return lengths_of_rays(x, y)
+
+
+def pixel_solid_angles(shape: tuple[int, ...], camera_matrix: Floats | None = None) -> Floats:
+    """Return the solid angle ``(H, W)`` of each pixel of a panorama, or of a photo, in steradians.
+
+    A photo's pixel at (x, y) on the plane at distance 1 has the angle (1 + x² + y²)^(−3/2) / f².
+
+    Args:
+        shape: ``(H, W)``.
+        camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for a panorama, whose
+            angles are one number of a row, which saves memory.
+    """
+    if camera_matrix is None:
+        return np.broadcast_to(equirect_solid_angles((shape[0], shape[1]))[:, None], shape)
+    angles: Floats = ray_lengths(camera_matrix, shape) ** -3
+    return angles / (camera_matrix[0, 0] * camera_matrix[1, 1])
 
 
 def lengths_of_rays(x: Floats, y: Floats) -> Floats:

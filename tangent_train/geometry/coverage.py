@@ -11,12 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry.sphere import (
-    equirect_directions,
-    equirect_solid_angles,
-    lonlat_to_xyz,
-    xyz_to_lonlat,
-)
+from tangent_train.geometry.camera import pixel_solid_angles
+from tangent_train.geometry.sphere import equirect_directions, lonlat_to_xyz, xyz_to_lonlat
 
 if TYPE_CHECKING:
     from tangent_train.geometry.grids import PinholeGrid
@@ -149,8 +145,7 @@ def _cells(
     """Return a mask, and the directions ``(n, 3)`` and solid angles ``(n,)`` of its cells."""
     shape, content = mask or ((1, 1), b"\1")
     cells = np.frombuffer(content, np.bool_).reshape(shape)
-    angles = np.broadcast_to(equirect_solid_angles(shape)[:, None], shape)
-    return cells, equirect_directions(shape)[cells], angles[cells]
+    return cells, equirect_directions(shape)[cells], pixel_solid_angles(shape)[cells]
 
 
 @lru_cache(maxsize=64)

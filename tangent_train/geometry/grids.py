@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
+from numbers import Real
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError, at_least
+from tangent_train.errors import SettingError, at_least, check_type
 from tangent_train.geometry.camera import half_width
 from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.geometry.icosphere import icosphere, vertex_resolution
@@ -201,10 +202,12 @@ class PinholeGrid:
 
         Raises:
             SettingError: There is no such image.
+            TypeError: It is not a list.
         """
         every = np.arange(self.num_images)
         if faces is None:
             return every
+        check_type("faces", faces, Iterable, "a list of indices, e.g. [0, 5]")
         try:
             return every[[*faces]]
         except IndexError as error:
@@ -441,6 +444,7 @@ class RingGrid(PinholeGrid):
         kinds: Any = {"row_pitch": row_pitch, "is_complete": is_complete}
         super().__init__(axes, (rows, columns), pitch, rotation, **kinds)
         resting = self.with_rotation(None)
+        check_type("valid", valid, (np.ndarray, type(None)), "an array of booleans")
         if is_complete:
             check_coverage([resting], valid, by_owners=by_owners)
             self.is_overlapping = overlaps(resting, valid)
@@ -448,9 +452,12 @@ class RingGrid(PinholeGrid):
 
 def _ring_centers(rings: Any) -> list[tuple[float, float]]:
     """Return longitudes and latitudes of the centers of views in rings, in degrees."""
+    check_type("rings", rings, Sequence, "a list of rings")
     at_least("number of rings", len(rings), 1)
     centers: list[tuple[float, float]] = []
     for ring in rings:
+        check_type("ring", ring, Mapping, "its pitch and views, e.g. {'pitch': 0, 'views': 8}")
+        check_type("pitch", ring.get("pitch"), Real, "degrees")
         views = at_least("views", ring.get("views"), 1)
         centers += [(360 / views * number, ring["pitch"]) for number in range(views)]
     return centers

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import equirect_solid_angles, ray_lengths
+from tangent_train.geometry import pixel_solid_angles
 from tangent_train.io.pixel_files import write_pixels
 from tangent_train.metrics.image_sums import Sums
 from tangent_train.metrics.scores import ScoreColumn
@@ -76,17 +76,11 @@ class PredictedImage(NamedTuple):
 
     @property
     def solid_angles(self) -> NDArray[np.floating]:
-        """Relative solid angles ``(h, w)`` of the pixels.
-
-        A photo's pixel at (x, y) on the plane at distance 1 has the angle (1 + x² + y²)^(−3/2).
-        """
-        image, shape = self.image, self.pixels.shape
-        if image.camera_matrix is not None:
-            return ray_lengths(image.camera_matrix, shape) ** -3.0
-        of_rows = equirect_solid_angles(image.shape)[:, None]
-        if image.area is not None:
-            of_rows = of_rows[image.area.places()[0]]
-        return np.broadcast_to(of_rows, shape)  # one number of a row, which saves memory
+        """Solid angles ``(h, w)`` of the pixels in steradians."""
+        angles: NDArray[np.floating] = self.image.cut(
+            pixel_solid_angles(self.image.shape, self.image.camera_matrix)
+        )
+        return angles
 
 
 class Head(nn.Module, ABC):

@@ -19,27 +19,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.ndimage import find_objects
 
+from datamodules.core.depth import STEPS_PER_M
 from models.segments import Segments
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    equirect_solid_angles,
     equirect_to_lonlat,
     lonlat_to_xyz,
-    ray_lengths,
+    pixel_solid_angles,
     xyz_to_lonlat,
 )
 from tangent_train.geometry.sphere import Floats
 from tangent_train.rendering import kernels
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.views import PinholeViews, Views
-
-Numbers = NDArray[np.int32]
-Matrix = Floats | None
-
-LEAST_OVERLAP = 0.3
-"""Intersection over union, at the directions that two views see, from which masks join; measured
-in docs/explanation/objects.md."""
+from tangent_train.rendering.resampling import resize
 
 _ROWS = 512
 """Rows of the canvas on which masks are compared, at most."""
@@ -54,7 +49,7 @@ _LEAST_SR = 1e-5
 
 
 _BOX = "longitude_deg", "latitude_deg", "width_deg", "height_deg"
-OBJECT_COLUMNS = ("number", "class", "score", *_BOX, "solid_angle_sr")
+OBJECT_COLUMNS = ("number", "class", "score", *_BOX, "solid_angle_sr", "distance_m")
 """Names in the table of objects, see `described`."""
 
 _STEPS = 3
@@ -68,18 +63,21 @@ class Objects(NamedTuple):
         numbers: ``(H, W)`` int32 number of the object at each pixel, 0 for none; 1 is the largest.
         classes: ``(n,)`` index of the class of each object.
         scores: ``(n,)`` confidence of each object, 0 to 1: the mean of its masks by solid angle.
+        solid_angles: ``(n,)`` steradians.
     """
 
     numbers: NDArray[np.int32]
     classes: NDArray[np.int64]
     scores: NDArray[np.float64]
+    solid_angles: NDArray[np.float64]
 
 
 def join_objects(
     sets: Sequence[tuple[Views, Sequence[Segments]]],
     shape: tuple[int, int],
-    camera_matrix: Matrix = None,
-    least_overlap: float = LEAST_OVERLAP,
+    camera_matrix: Floats | None = None,
+    valid: NDArray[np.bool_] | None = None,
+    least_overlap: float = 0.3,
 ) -> Objects:
     """Put together the objects of a panorama or photo.
 
@@ -87,7 +85,9 @@ def join_objects(
         sets: Sets of views, pinhole images or crops of one size, and the objects of each view.
         shape: ``(H, W)`` of the panorama or photo.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for a panorama.
-        least_overlap: See `LEAST_OVERLAP`.
+        valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
+        least_overlap: Intersection over union, at the directions that two views see, from which
+            masks join; measured in docs/explanation/objects.md.
 
     Raises:
         SettingError: The views are not pinhole images.
@@ -102,7 +102,8 @@ def join_objects(
     numbers = np.where(numbers > 0, numbers + first[:-1, None, None], 0)
     rows = min(shape[0], _ROWS)
     small = shape if camera_matrix is not None else (rows, 2 * rows)
-    weights = _pixel_weights(small, camera_matrix).ravel()
+    valid = np.ones(shape, np.bool_) if valid is None else valid
+    weights = (pixel_solid_angles(small, camera_matrix) * resize(valid, small, "nearest")).ravel()
     masks, seen = _incidence(numbers, _geometry(sets, small), weights, len(classes))
     view = np.repeat(np.arange(len(segments)), np.diff(first))
     group = _groups(masks, seen, view, classes, least_overlap)
@@ -118,12 +119,15 @@ def join_objects(
     of_masks = np.ones(len(group)), (group, np.arange(len(group)))
     in_groups = sparse.csr_array(of_masks, (len(total), len(group)))
     covered = (in_groups @ masks).astype(bool) @ weights
-    won = solid_angles(winners, len(total), camera_matrix)
+    winners *= valid
+    won: Any = np.bincount(
+        winners.ravel(), pixel_solid_angles(shape, camera_matrix).ravel(), len(total) + 1
+    )[1:]
     kept = np.flatnonzero((won >= _LEAST_SR) & (won >= _LEAST_SHARE * covered))
     kept = kept[np.argsort(-won[kept], kind="stable")]
     table = np.zeros(len(won) + 1, np.int32)
     table[kept + 1] = np.arange(1, len(kept) + 1)
-    return Objects(table[winners], class_of[kept], of_group[kept])
+    return Objects(table[winners], class_of[kept], of_group[kept], won[kept])
 
 
 def _geometry(sets: Sequence[tuple[Views, Any]], shape: tuple[int, int]) -> kernels.CanvasGeometry:
@@ -148,7 +152,7 @@ def _incidence(
     Args:
         numbers: ``(n, h, w)`` numbers of the masks, from 1; 0 for none.
         geometry: Geometry of the views and a canvas ``(H, W)``.
-        weights: ``(H W,)`` solid angle of the pixels of the canvas.
+        weights: ``(H W,)`` solid angle of the pixels of the canvas; 0 for invalid ones.
         count: Number of masks.
 
     Returns:
@@ -165,8 +169,9 @@ def _incidence(
         east, north = across * geometry.columns[:, column]
         u, v, w = matrix @ np.stack([east, north, up])
         x, y = np.floor(u / w + 0.5).astype(np.int64), np.floor(v / w + 0.5).astype(np.int64)
-        inside = (w > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        pixels.append((row * canvas[1] + column)[inside])
+        pixel = row * canvas[1] + column
+        inside = (w > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height) & (weights[pixel] > 0)
+        pixels.append(pixel[inside])
         found.append(of_view[y[inside], x[inside]])
     view = np.repeat(np.arange(len(pixels)), [len(of_view) for of_view in pixels])
     pixel, number = np.concatenate(pixels), np.concatenate(found)
@@ -208,25 +213,7 @@ def _groups(
     return found
 
 
-def solid_angles(numbers: Numbers, count: int, camera_matrix: Matrix = None) -> Floats:
-    """Return the solid angle ``(n,)`` of each object, in steradians."""
-    weights = _pixel_weights(numbers.shape, camera_matrix)
-    found: Any = np.bincount(numbers.ravel(), weights.ravel(), count + 1)
-    return np.asarray(found[1:], np.float64)
-
-
-def _pixel_weights(shape: tuple[int, ...], camera_matrix: Matrix) -> Floats:
-    """Return the solid angle of the pixels ``(H, W)`` of a panorama, or of a photo with K."""
-    if camera_matrix is None:
-        return np.broadcast_to(equirect_solid_angles((shape[0], shape[1]))[:, None], shape)
-    focal = camera_matrix[0, 0] * camera_matrix[1, 1]
-    weights: Floats = ray_lengths(camera_matrix, shape) ** -3 / focal
-    return weights
-
-
-def described(
-    objects: Objects, class_names: Sequence[str], camera_matrix: Matrix = None
-) -> list[dict[str, Any]]:
+def described(objects: Objects, class_names: Sequence[str], image: Any) -> list[dict[str, Any]]:
     """Return a table of objects in the order of their numbers.
 
     A spherical box has a center and a field of view: the object's ranges of longitude and latitude
@@ -235,39 +222,51 @@ def described(
     Args:
         objects: Objects of a panorama or photo.
         class_names: Names of the classes.
-        camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
+        image: `InputImage`, with depth for distances.
 
     Returns:
         For each object its ``number`` in the map, ``class``, ``score``; ``longitude_deg``,
         ``latitude_deg``, ``width_deg`` and ``height_deg`` of its box, in a photo relative to the
-        optical axis; and ``solid_angle_sr``.
+        optical axis; ``solid_angle_sr``; and ``distance_m``, the median of its known distances by
+        solid angle, None without any.
     """
-    numbers, count = objects.numbers, len(objects.scores)
-    pixels = np.flatnonzero(numbers)
-    pixels = pixels[np.argsort(numbers.ravel()[pixels], kind="stable")]
-    ends = np.cumsum(np.bincount(numbers.ravel(), minlength=count + 1)[1:])
-    entries = []
-    for k, part in enumerate(np.split(pixels, ends[:-1])[:count]):
-        center, extent = _box(_directions(part, numbers.shape, camera_matrix))
+    numbers, entries = objects.numbers, []
+    weights = pixel_solid_angles(numbers.shape, image.camera_matrix)
+    for k, part in enumerate(find_objects(numbers)):
+        place = tuple(np.argwhere(numbers[part] == k + 1).T + [[side.start] for side in part])
+        directions = _directions(place, numbers.shape, image.camera_matrix)
+        center, extent = _box(directions)
         # Between outer edges of pixels.
-        extent = np.minimum(extent + math.pi / numbers.shape[0], (2 * math.pi, math.pi))
+        extent = np.minimum(extent + math.sqrt(weights.max()), (2 * math.pi, math.pi))
+        distance = None
+        if image.depth is not None:
+            ahead = 1 if image.camera_matrix is None else directions[:, 0]
+            distance = _median(image.depth[place] / STEPS_PER_M / ahead, weights[place])
         entries.append(
             {
                 "number": k + 1,
                 "class": class_names[objects.classes[k]],
                 "score": round(float(objects.scores[k]), 4),
                 **dict(zip(_BOX, np.degrees([*center, *extent]).round(2).tolist(), strict=True)),
+                "solid_angle_sr": float(f"{objects.solid_angles[k]:.4g}"),
+                "distance_m": distance,
             }
         )
-    angles = solid_angles(numbers, count, camera_matrix).tolist()
-    for entry, angle in zip(entries, angles, strict=True):
-        entry["solid_angle_sr"] = float(f"{angle:.4g}")
     return entries
 
 
-def _directions(pixels: NDArray[np.intp], shape: tuple[int, ...], camera_matrix: Matrix) -> Floats:
-    """Return the directions ``(n, 3)`` of pixels, flat indices; x is straight ahead in a photo."""
-    row, column = np.unravel_index(pixels, shape)
+def _median(values: Floats, weights: Floats) -> float | None:
+    """Return the weighted median of the values above 0; None without any."""
+    known = values > 0
+    if not known.any():
+        return None
+    how: Any = {"weights": weights[known], "method": "inverted_cdf"}
+    return float(f"{np.quantile(values[known], 0.5, **how):.4g}")
+
+
+def _directions(place: Any, shape: tuple[int, ...], camera_matrix: Floats | None) -> Floats:
+    """Return the directions ``(n, 3)`` of rows and columns; x is straight ahead in a photo."""
+    row, column = place
     if camera_matrix is None:
         size = shape[0], shape[1]
         return lonlat_to_xyz(equirect_to_lonlat(np.stack([column, row], axis=-1), size))

@@ -20,7 +20,7 @@ from tangent_train.files import csv_text, write_text
 from tangent_train.heads import pictures
 from tangent_train.heads.base import PICTURES, RGB, PredictedImage, Scores
 from tangent_train.heads.classes import ClassesHead, LabelMosaic
-from tangent_train.heads.objects import OBJECT_COLUMNS, described, join_objects
+from tangent_train.heads.objects import OBJECT_COLUMNS, Objects, described, join_objects
 from tangent_train.io.pixel_files import read_rgb, write_pixels
 from tangent_train.metrics.image_sums import Sums, means_of_sums
 from tangent_train.metrics.panoptic import LABEL, quality
@@ -152,22 +152,22 @@ class PanopticHead(ClassesHead):
         return pixels // LABEL
 
     def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
-        """Return labels, numbers of objects, and their descriptions, which evaluations lack."""
+        """Return labels, numbers of objects, and rows of the table, which evaluations lack."""
         labels, numbers = np.divmod(predicted.pixels, LABEL)
-        text = (
-            "{class} {number}, score {score:.2f}, {width_deg:.1f}° × {height_deg:.1f}°".format_map
-        )
-        segments = predicted.facts.get("segments", ())
-        objects = [segment for segment in segments if "number" in segment]
-        texts = {segment["number"]: text(segment) for segment in objects}
-        return {"prediction": labels, "numbers": numbers, "objects": texts}
+        rows = {
+            segment["number"]: {name: segment[name] for name in OBJECT_COLUMNS}
+            for segment in predicted.facts.get("segments", ())
+            if "number" in segment
+        }
+        return {"prediction": labels, "numbers": numbers, "objects": rows}
 
     def entry(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> dict[str, Any]:
         """Return the shares of the classes, and COCO's ``segments_info`` with the table of objects.
 
         Segments that are masked are left out.
         """
-        codes, of_number = predicted.pixels, {e["number"]: e for e in predicted.facts["objects"]}
+        table = described(predicted.facts["objects"], self.class_names[1:], predicted.image)
+        codes, of_number = predicted.pixels, {row["number"]: row for row in table}
         ids, index, counts = np.unique(codes, return_inverse=True, return_counts=True)
         boxes = find_objects(index.reshape(codes.shape) + 1)
         segments = []
@@ -209,7 +209,7 @@ class PanopticMosaic(LabelMosaic):
     """Probabilities of classes and objects of views, from which `pixels` are a panoptic map.
 
     Attributes:
-        facts: ``objects`` is a table of the objects, after `pixels`.
+        facts: ``objects`` are the `Objects`, after `pixels`.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ class PanopticMosaic(LabelMosaic):
         # With that of the class −1 at the end.
         self._camera_matrix, self._things = camera_matrix, np.append(head.is_thing[1:], False)
         self._sets: list[tuple[Views, Sequence[Segments]]] = []
-        self._objects: list[dict[str, Any]] = []
+        self._objects: Objects | None = None
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -241,11 +241,8 @@ class PanopticMosaic(LabelMosaic):
     def pixels(self) -> Tensor:
         """Return a panoptic map ``(H, W)``, int32."""
         labels = super().pixels().int()
-        found = join_objects(self._sets, self.shape, self._camera_matrix)
-        if self.valid is not None:
-            found = found._replace(numbers=np.where(self.valid, found.numbers, 0))
-        names = self._head.class_names[1:]
-        self._objects = described(found, names, self._camera_matrix)
+        found = join_objects(self._sets, self.shape, self._camera_matrix, self.valid)
+        self._objects = found
         numbers = torch.from_numpy(found.numbers).to(labels.device)
         of_objects = torch.from_numpy(np.append(0, found.classes + 1)).to(labels)
         return torch.where(numbers > 0, of_objects[numbers], labels) * LABEL + numbers

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, Literal, NamedTuple, TypedDict, Unpack, overload
@@ -26,6 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import PositiveInt
 from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps
@@ -37,12 +39,14 @@ from datamodules.core.label_map import (
     read_label_map,
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.config.settings import Prompts
-from tangent_train.errors import SettingError, check_choice, width_height
+from tangent_train.config.build import checks_types
+from tangent_train.config.settings import Prompts, Threshold
+from tangent_train.errors import SettingError, at_least, check_choice, check_type, width_height
 from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
+from tangent_train.heads.objects import described
 from tangent_train.inference.engine import Predictor, UpLikelihood, views_per_forward
 from tangent_train.inference.images import (
     InputImage,
@@ -52,13 +56,13 @@ from tangent_train.inference.images import (
     with_up,
 )
 from tangent_train.inference.views import Levels, ViewChoice, ViewSelector
-from tangent_train.io.gpano import Fill
+from tangent_train.io.gpano import Eye, Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
 from tangent_train.metrics.panoptic import LABEL
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
-from tangent_train.rendering.forward import check_panorama
+from tangent_train.rendering.forward import check_grid, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic, blend_back
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.resampling import Pixels, reduce_to_pitch
@@ -80,6 +84,7 @@ class ImageSettings(TypedDict, total=False):
     area: Sequence[float] | None
     upright: Upright
     mask: Mask | str | NDArray[Any] | Tensor
+    eye: Eye | None
 
 
 class LabelSettings(ImageSettings, total=False):
@@ -90,21 +95,22 @@ class LabelSettings(ImageSettings, total=False):
     prompts: Prompts | None
 
 
+@checks_types
 def load(
     path: str | Path,
     *,
     prompts: Prompts | None = None,
-    threshold: float | None = None,
+    threshold: Threshold | None = None,
     label_map: str | Path | None = None,
     unmapped: Unmapped = "unknown",
     device: str | int | torch.device = "cpu",
     levels: Levels = None,
     base_level: int | None = None,
     blend: Blend = "feather",
-    rotations: int = 1,
+    rotations: PositiveInt = 1,
     views: ViewChoice = None,
     fill: Fill | None = None,
-    view_batch_size: int | None = None,
+    view_batch_size: PositiveInt | None = None,
     compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
     min_confidence: float = 0.0,
     align: Align | None = None,
@@ -149,6 +155,7 @@ def load(
         DataError: A file cannot be used.
         SettingError: A setting does not suit the network.
     """
+    check_type("path", path, (str, Path), "the path of a network's file")
     of_file = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
     # A setting of another head is an unexpected argument.
     of_head = {"min_confidence": min_confidence, "align": align}
@@ -215,6 +222,7 @@ class Network:
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
+        eye: Eye | None = None,
         prompts: Prompts | None = None,
     ) -> NDArray[Any] | Tensor:
         """Return the label of every pixel.
@@ -222,7 +230,8 @@ class Network:
         Args:
             image: A panorama, or a photo.
             depth: ``(H, W)`` floats in meters, 0 or NaN where missing, for networks with depth as
-                an input: distance from the center for panoramas, z-depth for photos.
+                an input, and for the distances of objects: distance from the center for panoramas,
+                z-depth for photos.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
             area: West, east, south and north of a part of a panorama in degrees, see
                 `read_area`. None to use the GPano tags of a file, or the whole sphere
@@ -232,6 +241,7 @@ class Network:
             max_tilt_deg: Largest tilt that ``auto`` considers, in degrees.
             mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
                 a file; or 0 in an array or tensor. See `Masks`.
+            eye: Eye of a stereo panorama, see `eye_part`; the labels are those of its picture.
             prompts: Texts that become the classes of CLIPSeg or SAM 3, see `load`; the network
                 keeps them.
 
@@ -244,7 +254,7 @@ class Network:
             SettingError: The image cannot be used, or the network needs another input.
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        given = self._read(image, depth, fov, area, upright, max_tilt_deg, prompts)
+        given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye, prompts)
         found = self._predictor.predict(given).pixels().cpu().numpy()
         if self.loaded.things:
             found = (found // LABEL).astype(np.uint8)
@@ -274,7 +284,7 @@ class Network:
         given = self._read(image, **settings)
         mosaic = self._predictor.predict(given)
         found = given.cut(mosaic.pixels().cpu().numpy())
-        return found, mosaic.facts["objects"]
+        return found, described(mosaic.facts["objects"], self.loaded.class_names[1:], given)
 
     @overload
     def depth(self, image: Tensor, **settings: Unpack[ImageSettings]) -> Tensor: ...
@@ -292,7 +302,7 @@ class Network:
         Args:
             image: A panorama, or a photo.
             mask: Pixels of a panorama that get NaN, see `labels`.
-            **settings: ``fov``, ``area`` and ``upright`` of `labels`. Of ``upright``, only
+            **settings: ``fov``, ``area``, ``upright`` and ``eye`` of `labels`. Of ``upright``, only
                 ``pose`` suits a depth network.
 
         Returns:
@@ -345,6 +355,7 @@ class Network:
         area: Sequence[float] | None = None,
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
+        eye: Eye | None = None,
         prompts: Prompts | None = None,
     ) -> InputImage:
         """Return a photo, or a panorama with its zenith; set the prompts."""
@@ -356,7 +367,9 @@ class Network:
         if fov is not None:
             return read_photo(image, fov, of_size)
         check_choice("upright", upright or "pose", ("pose", "auto"))
-        panorama = read_panorama(image, area, upright, of_size)
+        check_type("max_tilt_deg", max_tilt_deg, Real, "degrees")
+        check_choice("eye", eye or "left", ("left", "right"))
+        panorama = read_panorama(image, area, upright, of_size, eye)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._up_likelihood)
         return panorama
@@ -364,12 +377,13 @@ class Network:
     def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16]:
         """Return depth in steps of 1/512 m, of the size of the image."""
         array = depth.numpy(force=True) if isinstance(depth, Tensor) else np.asarray(depth)
-        is_read = "depth" in self.loaded.inputs
+        is_read = "depth" in self.loaded.inputs or self.loaded.things
         if not is_read or (array.shape, array.dtype.kind) != (size, "f"):
             raise SettingError(
                 "depth",
                 found="none" if depth is None else f"shape {array.shape} of {array.dtype}",
-                expected=f"floats in meters, {width_height(size)}, for a network that takes depth",
+                expected=f"floats in meters, {width_height(size)}, for a network that takes depth "
+                "or returns objects",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
 
@@ -444,8 +458,12 @@ def apply(
     >>> apply(brightness, np.full((32, 64, 3), 0.5), TangentGrid(0, 4))[0, 0]
     np.float32(0.5)
     """
+    check_type("function", function, Callable, "a function of images")  # type: ignore[arg-type]
+    check_grid(grid)
     blend = blend_back(grid, blend)
     check_panorama(panorama, "bilinear")
+    if images_per_call is not None:
+        at_least("images_per_call", images_per_call, 1)
     step = images_per_call or views_per_forward(grid.size)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     shape, views = (rows, columns), PinholeViews(grid)
@@ -523,6 +541,7 @@ def load_label_map(given: str | Path) -> LabelMap:
         SettingError: There is no map of this name.
         DataError: The file is missing or is not a valid label map.
     """
+    check_type("label_map", given, (str, Path), "a name or a path")
     return read_label_map(label_map_file(given))
 
 

@@ -15,7 +15,7 @@ from datamodules.core.depth import meters_to_steps, resize_depth
 from datamodules.core.label_map import PIXEL_CLASSES
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
-from tangent_train.io.gpano import PanoramaArea, read_area, read_tags, read_up
+from tangent_train.io.gpano import PanoramaArea, eye_part, read_area, read_tags, read_up
 from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from tangent_train.io.videos import Frame
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from tangent_train.inference.engine import UpLikelihood
+    from tangent_train.io.gpano import Eye
     from tangent_train.kinds import Upright
 
     DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16]]
@@ -134,6 +135,7 @@ def read_panorama(
     angles: Sequence[float] | None = None,
     upright: Upright = None,
     depth: DepthOfSize | None = None,
+    eye: Eye | None = None,
 ) -> InputImage:
     """Read a panorama of the whole sphere or a part of it.
 
@@ -143,6 +145,7 @@ def read_panorama(
         upright: Source of the zenith: ``pose`` and ``auto`` read GPano tags (without tags,
             `with_up` estimates it for ``auto``); None for z.
         depth: Function that returns its depth.
+        eye: Eye of a stereo panorama, see `eye_part`; frames have only one.
 
     Returns:
         An image of the whole sphere, black outside its area.
@@ -158,6 +161,8 @@ def read_panorama(
         expected = "the path of a file: images in memory and videos without metadata have no pose"
         raise SettingError("upright", found="pose", expected=expected)
     path = path or _IN_MEMORY
+    if not isinstance(image, Frame):
+        rgb = rgb[eye_part(path, (rgb.shape[0], rgb.shape[1]), eye, angles, tags)]
     size = rgb.shape[0], rgb.shape[1]
     area = read_area(path, size, angles, tags=tags)
     steps = None if depth is None else area.place(depth(size))

@@ -1,4 +1,4 @@
-"""Decode images that Pillow opens, and their colors in sRGB."""
+"""Decode images that Pillow opens: whole files only, and their colors in sRGB."""
 
 from __future__ import annotations
 
@@ -21,25 +21,37 @@ _COLOR_STEPS = np.arange(0, 256, 17, dtype=np.uint8)
 _DAMAGE = ("Corrupt JPEG data", "Premature end of JPEG file")
 """Beginnings of libjpeg's warnings about damage; others are about odd headers."""
 
+_LOST = 256  # zero bytes at the end: part of a file that was never copied
 
-def load_pixels(image: Image.Image, file: IO[bytes]) -> Image.Image | NDArray[np.uint8]:
-    """Decode the pixels of an image.
 
-    JPEG is decoded by simplejpeg, which is faster than Pillow and refuses damage in the middle.
+def load_whole(image: Image.Image, file: IO[bytes]) -> Image.Image | NDArray[np.uint8]:
+    """Decode the pixels of an image; refuse damage that Pillow does not notice.
+
+    Pillow ignores libjpeg's warnings, the checksums of PNG, and the padding of AV1 data. JPEG is
+    decoded by simplejpeg, which is faster too, and AVIF by OpenCV with libaom.
 
     Args:
         image: Image that Pillow opened.
         file: Its file.
 
     Returns:
-        The decoded image; gray and RGB pixels of JPEG as an array.
+        The decoded image; gray and RGB pixels of JPEG and AVIF as an array.
 
     Raises:
         ValueError: The image is damaged; the decoders raise other errors too.
     """
+    file.seek(0)
     if image.format in ("JPEG", "MPO"):
-        file.seek(0)
         return _decode_jpeg(image, file.read())
+    if image.format == "AVIF":
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        pixels = decode_by_opencv(file, flags)
+        if image.mode == "RGB":  # OpenCV blends colors with transparency
+            return pixels
+    elif image.format == "PNG":
+        Image.open(file, formats=["PNG"]).verify()
+    elif image.format in ("WEBP", "HEIF") and not any(file.read()[-_LOST:]):
+        raise ValueError("zeros at the end of the file")
     image.load()
     return image
 
@@ -99,6 +111,22 @@ def to_srgb(image: Image.Image, profile: bytes | None, subject: object) -> Image
             stacklevel=2,
         )
         return image
+
+
+def deep_to_srgb(pixels: NDArray[np.uint16], profile: bytes, subject: object) -> NDArray[np.uint16]:
+    """Convert colors of 16 bits as `to_srgb`, by interpolation between colors of 8 bits."""
+    low, rest = np.divmod(pixels, 257)  # 65535 = 255 · 257
+    eight = Image.fromarray(low.astype(np.uint8))
+    converted = to_srgb(eight, profile, subject)
+    if converted is eight:
+        return pixels
+    base = result = np.array(converted, np.float32)
+    for channel in np.eye(pixels.shape[2], dtype=np.uint8) if pixels.ndim == 3 else [np.uint8(1)]:
+        above = Image.fromarray(np.minimum(low + channel, 255).astype(np.uint8))
+        share = (rest * channel).max(axis=-1) if pixels.ndim == 3 else rest
+        step = np.asarray(to_srgb(above, profile, subject)) - base
+        result = result + step * (share / np.float32(257))[..., None]
+    return np.rint(result * 257).clip(0, 65535).astype(np.uint16)
 
 
 @lru_cache(maxsize=16)

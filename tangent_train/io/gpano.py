@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -44,12 +45,21 @@ _MOST_COLUMNS = 32768  # columns of the whole panorama
 _NOT_WHOLE = (
     "For a part of a panorama, give area=[west,east,south,north] in degrees, or GPano tags in its "
     "XMP data. For a photo, give fov=, its horizontal field of view in degrees; tangent-predict "
-    "also needs projection=perspective. Of a stereo panorama, cut out the picture of one eye."
+    "also needs projection=perspective. For a stereo panorama, two pictures above or beside each "
+    "other, give eye=left or eye=right."
 )
 _SAME_AREA = (
     "All images of a data set show the same area: give data.area=[west,east,south,north] in degrees"
     " for a part of a panorama."
 )
+
+Eye = Literal["left", "right"]
+"""Eye of a stereo panorama; the left one is at the top, or at the left, unless tags differ."""
+
+_LAYOUTS = {"top-bottom": (2, 1), "left-right": (1, 2), "bottom-top": (2, 1), "right-left": (1, 2)}
+"""Pictures below and beside each other by `StereoMode`, which names the left eye first."""
+_MONO = ("", "mono")
+_UNTAGGED = ("top-bottom", "left-right")
 
 Fill = Literal["black", "mean", "edge", "reflect"]
 """Colors of a panorama outside its area: black; the mean color of the image; its nearest edge
@@ -180,11 +190,7 @@ def read_area(
     left, width = (west + 180) / 360, _width_deg(west, east) / 360
     top, height = (90 - north) / 180, (north - south) / 180
     shown = f"square pixels in area={[west, east, south, north]}"
-    tags = read_tags(path) if tags is None else tags
-    if (stereo := tags.get("StereoMode", "mono")).lower() not in ("", "mono"):
-        found = f"a stereo panorama ({stereo}), by its metadata"
-        raise DataError(path, found=found, expected="one picture", remedy=remedy)
-    tags = {} if angles else tags
+    tags = {} if angles else read_tags(path) if tags is None else tags
     if tags.keys() >= set(PART_TAGS) or not _is_equirect(tags):
         shown = f"square pixels in the part of its GPano tags, {tags}"
         left, width, top, height = _tagged_part(tags)
@@ -211,6 +217,68 @@ def read_area(
     return PanoramaArea((full_height, full_width), *bounds, size)
 
 
+def eye_part(
+    path: Path,
+    size: tuple[int, int],
+    eye: Eye | None,
+    angles: Sequence[float] | None,
+    tags: Mapping[str, str],
+) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that one eye sees.
+
+    A stereo panorama has two pictures of the same size, below or beside each other, by its
+    `StereoMode`; without it, in the layout in which they fit the area. Two whole panoramas are
+    below each other in a square image, and beside each other in one four times as wide as high.
+
+    Args:
+        path: File, for messages.
+        size: Rows and columns of the image.
+        eye: The eye; None for an image that is not stereo.
+        angles: See `read_area`.
+        tags: Its tags.
+
+    Raises:
+        DataError: It is stereo and no eye is given, or the other way round.
+    """
+    if eye is None:
+        refuse_stereo(path, tags)
+        return slice(None), slice(None)
+    stated = tags.get("StereoMode", "").lower()
+    for layout in (stated,) if stated in _LAYOUTS else _UNTAGGED:
+        rows, columns = (n // parts for n, parts in zip(size, _LAYOUTS[layout], strict=True))
+        second = (eye == "right") == (layout in _UNTAGGED)
+        top, left = (second * n % whole for n, whole in zip((rows, columns), size, strict=True))
+        with suppress(DataError):
+            read_area(path, (rows, columns), angles, tags=tags)
+            return slice(top, top + rows), slice(left, left + columns)
+    raise DataError(
+        path,
+        found=f"{width_height(size)}, {stated or 'without stereo metadata'}",
+        expected=f"two pictures above or beside each other, for eye={eye}: each of a whole "
+        "panorama, twice as wide as high, or of area=",
+        remedy="Leave eye= out for a panorama of one picture.",
+    )
+
+
+def refuse_stereo(path: Path, tags: Mapping[str, str]) -> None:
+    """Raise DataError if an image is stereo by its tags."""
+    stated = tags.get("StereoMode", "").lower()
+    if stated not in _MONO:
+        raise DataError(
+            path,
+            found=f"a stereo panorama ({stated}), by its metadata",
+            expected="one picture",
+            remedy="Give eye=left or eye=right to use the picture of one eye. In data sets, cut it "
+            "out, from labels and depth too, and remove the tag.",
+        )
+
+
+def shape_of(size: tuple[int, int], part: tuple[slice, slice]) -> tuple[int, int]:
+    """Return rows and columns of a part of an image, see `eye_part`."""
+    rows, columns = (len(range(n)[taken]) for n, taken in zip(size, part, strict=True))
+    return rows, columns
+
+
 def _is_equirect(tags: Mapping[str, str]) -> bool:
     return tags.get("ProjectionType", "equirectangular").lower() == "equirectangular"
 
@@ -223,6 +291,10 @@ def _tagged_part(tags: Mapping[str, str]) -> tuple[float, float, float, float]:
     full_width, full_height, width, height, left, top = (
         _number(tags.get(name, "")) for name in PART_TAGS
     )
+    if math.isclose(full_width, full_height):  # of two pictures, below each other
+        full_height, height, top = full_height / 2, height / 2, top / 2
+    elif math.isclose(full_width, 4 * full_height):  # beside each other
+        full_width, width, left = full_width / 2, width / 2, left / 2
     is_inside = 0 < width <= full_width and 0 <= top <= full_height - height < full_height
     if not (
         _is_equirect(tags)
@@ -251,9 +323,10 @@ def check_resolution(
         angles: The area in degrees; None for the whole sphere.
 
     Raises:
-        DataError: Its pixels would not be square.
+        DataError: Its pixels would not be square, or it is stereo by its tags.
         SettingError: It has fewer pixels.
     """
+    refuse_stereo(path, read_tags(path))
     whole = check_area(angles) if angles is None else angles
     rows = read_area(path, size, whole, _SAME_AREA).full_shape[0]
     if size[1] < canvas.image_shape[1] - 1:
@@ -300,20 +373,35 @@ def read_up(path: Path, tags: Mapping[str, str] | None = None) -> NDArray[np.flo
 
 
 def read_tags(path: Path) -> dict[str, str]:
+    """Read the GPano and GSpherical tags of an image, see `tags_of`.
+
+    Raises:
+        DataError: The file cannot be read, or XMP data with this namespace are not XML.
+    """
+    return tags_of(path, read_xmp(path))
+
+
+def tags_of(path: Path, packet: bytes) -> dict[str, str]:
     """Return the simple GPano and GSpherical properties in XMP data, by local name.
 
     A property may have any prefix, and may be an attribute or an element (XMP specification, part
-    1). Properties of structures are ignored: they may describe another image.
+    1). Properties of structures are ignored: they may describe another image. In videos the root
+    itself has the properties (Google's Spherical Video V1).
+
+    Args:
+        path: File, for messages.
+        packet: XMP data; may be empty.
 
     Raises:
-        DataError: The file cannot be read, or XMP data with these namespaces are not XML.
+        DataError: Data with this namespace are not XML.
     """
-    packet = read_xmp(path).strip(b"\0 \n")
+    packet = packet.strip(b"\0 \n")
     # A document type, which XMP does not have, could define entities that grow.
     if not any(name.encode() in packet for name in _NAMESPACES) or b"<!DOCTYPE" in packet:
         return {}
     try:
         root = ElementTree.fromstring(packet)
+        nodes = [root, *(node for rdf in root.iter(_RDF) for node in rdf)]
     except (SyntaxError, ValueError) as error:
         raise DataError(
             path,
@@ -322,7 +410,7 @@ def read_tags(path: Path) -> dict[str, str]:
             remedy="Write the tags again, or remove them: exiftool -XMP:all= <file>.",
         ) from error
     values: dict[str, str] = {}
-    for node in (node for rdf in root.iter(_RDF) for node in rdf):
+    for node in nodes:
         values |= node.attrib | {child.tag: child.text or "" for child in node}
     return {
         name.removeprefix(start): value.strip()

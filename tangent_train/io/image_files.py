@@ -38,6 +38,13 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 HEIF_SUFFIXES = (".heic", ".heics", ".heif", ".heifs", ".hif")
 """Suffixes of HEIF images, which are read with the extra ``heif``."""
 
+_OTHER_SUFFIXES = (
+    *(".jxl", ".jp2", ".j2k", ".jpx", ".jpf", ".jxr", ".avif", ".insp", ".gpr", ".psd", ".tga"),
+    *(".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw"),
+    *(".hdr", ".pnm", ".ppm", ".pgm", ".pfm", ".svg", ".ico", ".dds", ".qoi", ".jls", ".pcx"),
+)
+"""Suffixes of images that are not read: such files are listed, and refused when they are read."""
+
 _SYSTEM_NAMES = {"thumbs.db", "ehthumbs.db", "desktop.ini", "@eadir", "#recycle", "$recycle.bin"}
 """Names in lower case that Windows and network storage write into folders of images."""
 
@@ -67,7 +74,7 @@ def image_paths(
 
     Returns:
         Sorted paths. From folders and patterns: visible files with one of the suffixes, in lower
-        or upper case, and HEIF images.
+        or upper case, and images of formats that are not read.
 
     Raises:
         DataError: No image was found, or a folder cannot be opened.
@@ -82,7 +89,7 @@ def image_paths(
     # Broken links are kept, so that reading them is an error.
     files = {file for file in named if not file.is_dir() and is_wanted(file, path)}
     found = {file for file in files if not is_result(file)}
-    known = {*suffixes, *HEIF_SUFFIXES}
+    known = {*suffixes, *HEIF_SUFFIXES, *_OTHER_SUFFIXES}
     images = sorted(file for file in found if file.suffix.lower() in known)
     skipped = Counter(file.suffix.lower() or "without suffix" for file in found.difference(images))
     kinds = ", ".join(f"{count} {repr(kind)[1:-1]}" for kind, count in sorted(skipped.items()))

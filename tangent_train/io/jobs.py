@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -11,11 +11,13 @@ from typing import Any
 
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.io.gpano import Eye, eye_part, shape_of
 from tangent_train.io.image_files import VIDEO_SUFFIXES, input_paths, short_names
 from tangent_train.io.videos import (
     Frame,
     read_frames,
     read_video_size,
+    read_video_tags,
 )
 from tangent_train.progress import progress_bar
 from tangent_train.threads import in_threads
@@ -65,13 +67,15 @@ class Video:
 
     Attributes:
         path: File of the video.
-        size: Number of frames, and rows and columns of a frame.
+        size: Number of frames, and rows and columns that are used of a frame.
         frames: Names of the frames that are used, with their numbers in the video.
+        part: Rows and columns of a frame that are used, see `eye_part`.
     """
 
     path: Path
     size: tuple[int, int, int]
     frames: dict[str, int]
+    part: tuple[slice, slice]
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,13 @@ class Inputs:
     every: int
 
     @classmethod
-    def find(cls, pattern: str | Path, every: int = 1) -> Inputs:
+    def find(
+        cls,
+        pattern: str | Path,
+        every: int = 1,
+        eye: Eye | None = None,
+        angles: Sequence[float] | None = None,
+    ) -> Inputs:
         """Find images and videos, see `image_paths`.
 
         Folders below the given one that a command wrote are skipped.
@@ -99,6 +109,8 @@ class Inputs:
         Args:
             pattern: A file, a folder, or a pattern.
             every: Step between the frames of a video: the first and then every n-th one.
+            eye: See `eye_part`, for videos.
+            angles: See `eye_part`, for videos.
 
         Raises:
             DataError: There are no images and videos.
@@ -111,12 +123,13 @@ class Inputs:
                 continue
             # The frames get a folder, which may also be one of images.
             name = short + path.suffix if path.with_suffix("").is_dir() else short
-            job = Job(name, path).then(lambda job: read_video_size(job.path))
+            job = Job(name, path).then(lambda job: _sized(job.path, eye, angles))
             if job.error:
                 inputs.broken[name] = job
             else:
-                frames = {f"{name}/{n:06d}": n for n in range(0, job.value[0], every)}
-                inputs.videos[name] = Video(path, job.value, frames)
+                size, part = job.value
+                frames = {f"{name}/{n:06d}": n for n in range(0, size[0], every)}
+                inputs.videos[name] = Video(path, size, frames, part)
         return inputs
 
     @property
@@ -136,7 +149,7 @@ class Inputs:
 
     def _frames(self, video: Video, wanted: set[str]) -> Iterator[Job]:
         """Decode a video up to the last wanted frame; after damage, the other frames fail."""
-        frames = read_frames(video.path, video.size[0], self.every)
+        frames = read_frames(video.path, video.size[0], self.every, video.part)
         last = max(number for name, number in video.frames.items() if name in wanted)
         error = ""
         for name, number in video.frames.items():
@@ -150,6 +163,16 @@ class Inputs:
                     error = str(damage)
             if name in wanted:
                 yield Job(name, video.path, frame, error, place)
+
+
+def _sized(
+    path: Path, eye: Eye | None, angles: Sequence[float] | None
+) -> tuple[tuple[int, int, int], tuple[slice, slice]]:
+    """Return the size of a video and the part of its frames that one eye sees, see `Video`."""
+    count, *size = read_video_size(path)
+    shape = size[0], size[1]
+    part = eye_part(path, shape, eye, angles, read_video_tags(path))
+    return (count, *shape_of(shape, part)), part
 
 
 def work_on(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, check_type
 from tangent_train.io.gpano import PanoramaArea, read_area
 from tangent_train.io.image_files import NamedFiles
 from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_image_size, read_pixels
@@ -65,6 +65,7 @@ class Masks:
                 raise SettingError(setting, found=mask, expected=expected)
             self._lowest_deg = mask
         elif mask is not None:
+            check_type(setting, mask, (str, Path), "a latitude in degrees, a path or an array")
             self._path = Path(mask)
             self.of_each = self._path.is_dir()
             self._files = NamedFiles(self._path)

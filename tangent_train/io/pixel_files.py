@@ -7,6 +7,7 @@ more than 8 bits, OpenEXR its own format; OpenCV writes.
 from __future__ import annotations
 
 import math
+import mmap
 import os
 import struct
 import zlib
@@ -24,9 +25,10 @@ from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image
 from PIL.ExifTags import Base as Tag
 
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, of_extra, width_height
 from tangent_train.files import atomic_path, checked_file, reserve, write_bytes
-from tangent_train.io.decoders import decode_by_opencv, load_pixels, to_srgb
+from tangent_train.io.decoders import decode_by_opencv, deep_to_srgb, load_whole, to_srgb
 from tangent_train.io.exr import open_exr, write_exr
 from tangent_train.io.image_files import (
     HEIF_SUFFIXES,
@@ -50,6 +52,8 @@ READABLE_SUFFIXES = (*_WRITABLE, ".npy", ".exr")
 """Suffixes that `read_pixels` takes, in lower case."""
 
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
+_FULL_RANGE = 2**14  # 16-bit colors below it probably have 14 bits or fewer
+_has_warned = mmap.mmap(-1, 1)  # shared with forked processes, which read training data
 _MOST_XMP = 2**24
 _FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
 _UNSIGNED = 1  # SampleFormat of TIFF
@@ -135,7 +139,9 @@ def _open_stored(path: Path, file: IO[bytes], channel: str | None) -> _StoredIma
     layout = str(image.tile[0][3]) if image.format == "PNG" else ""
     if layout.endswith("16B"):  # Pillow would cut colors to 8 bits
         profile = image.info.get("icc_profile")
-        return _StoredImage(size, lambda _: _decode_deep_png(file, layout), orientation, profile)
+        return _StoredImage(
+            size, lambda _: _decode_deep_png(file, image, layout), orientation, profile
+        )
     return _StoredImage(size, partial(_decode, image, file), orientation)
 
 
@@ -153,7 +159,7 @@ def _orientation(image: Image.Image) -> int:
 
 def _decode(image: Image.Image, file: IO[bytes] | None, meaning: _Meaning) -> NDArray[Any]:
     """Decode an image of 8 bits from its file, or one that is decoded already."""
-    whole = image if file is None else load_pixels(image, file)
+    whole = image if file is None else load_whole(image, file)
     profile = image.info.get("icc_profile") if meaning == "colors" else None
     if isinstance(whole, np.ndarray) and not profile:
         return whole
@@ -174,21 +180,23 @@ def _decode(image: Image.Image, file: IO[bytes] | None, meaning: _Meaning) -> ND
     return np.array(image if image.mode in ("L", "RGB") else image.convert("RGB"))
 
 
-def _decode_deep_png(file: IO[bytes], layout: str) -> NDArray[Any]:
+def _decode_deep_png(file: IO[bytes], image: Image.Image, layout: str) -> NDArray[Any]:
+    load_whole(image, file)
     pixels = decode_by_opencv(file, cv2.IMREAD_UNCHANGED)
     pixels = pixels if pixels.ndim == 2 else pixels[..., 2::-1]
     return pixels[..., 0] if layout.startswith("LA") else pixels
 
 
 def _deep_page(file: IO[bytes]) -> Any:
-    """Return the first page if tifffile decodes it; None to use Pillow."""
+    """Return the page that tifffile decodes, the first of full size; None to use Pillow."""
     try:
-        page: Any = tifffile.TiffFile(file).pages[0]
+        pages: Any = tifffile.TiffFile(file).pages
+        page = next((one for one in pages if not one.is_reduced), pages[0])
     except Exception:  # the parser raises many kinds of errors; Pillow names them
         return None
     is_shallow = page.sampleformat == _UNSIGNED and np.max(page.bitspersample) <= 8
     is_shallow &= page.fillorder == tifffile.FILLORDER.MSB2LSB
-    return None if is_shallow else page
+    return None if is_shallow and page.index == 0 else page
 
 
 def _decode_deep_tiff(file: IO[bytes], page: Any) -> NDArray[Any]:
@@ -199,7 +207,7 @@ def _decode_deep_tiff(file: IO[bytes], page: Any) -> NDArray[Any]:
     is_plain &= tifffile.EXTRASAMPLE.ASSOCALPHA not in page.extrasamples
     is_planar = channels > 1 and page.planarconfig == tifffile.PLANARCONFIG.SEPARATE
     is_lzw = page.compression == tifffile.COMPRESSION.LZW  # tifffile needs another package for it
-    if not is_plain or (is_lzw and is_planar):
+    if not is_plain or (is_lzw and (is_planar or page.index)):
         raise ValueError(f"TIFF layout: {channels} channels, {page.photometric!r}")
     pixels = decode_by_opencv(file, cv2.IMREAD_UNCHANGED) if is_lzw else page.asarray()
     pixels = pixels[..., 2::-1] if is_lzw and channels > 1 else pixels
@@ -270,7 +278,7 @@ def read_pixels(
         path: An image of `IMAGE_FORMATS` (its first picture), OpenEXR (see `open_exr`) or ``.npy``.
         indices: True to read indices, not colors, from images with a palette or of 1 bit, and
             depth, not colors, from OpenEXR images.
-        in_srgb: True to convert colors by an embedded color profile to sRGB; of 16 bits to 8.
+        in_srgb: True to convert colors by an embedded color profile to sRGB.
         channel: Channel of OpenEXR images; None as `open_exr` chooses it.
 
     Returns:
@@ -283,9 +291,7 @@ def read_pixels(
     with _opened(path, channel) as stored:
         pixels = stored.decode("indices" if indices else "colors" if in_srgb else "values")
         if in_srgb and stored.profile and pixels.dtype == np.uint16:
-            eight = Image.fromarray((pixels >> 8).astype(np.uint8))
-            converted = to_srgb(eight, stored.profile, path)
-            pixels = pixels if converted is eight else np.array(converted)
+            pixels = deep_to_srgb(pixels, stored.profile, path)
         return _displayed(pixels, stored.orientation)
 
 
@@ -296,6 +302,22 @@ def _check_pixels(
         found = f"{pixels.dtype} of shape {pixels.shape}"
         raise DataError(subject, found=found, expected=expected)
     return pixels
+
+
+def _warn_of_range(subject: object, largest: int) -> None:
+    """Print, once in a run, that 16-bit colors have fewer bits."""
+    if 0 < largest < _FULL_RANGE and not _has_warned[0]:
+        _has_warned[0] = 1
+        print_text(
+            f"Warning: {subject}: the largest value of 16-bit colors is {largest}, of 65535; they "
+            "are read as dark. If images have fewer bits, scale their values to 65535.",
+            error=True,
+        )
+
+
+def has_warned_of_range() -> bool:
+    """Return True if this run has printed that 16-bit colors have fewer bits."""
+    return bool(_has_warned[0])
 
 
 def read_rgb(image: Path | Image.Image, *, as_stored: bool = False) -> NDArray[np.uint8]:
@@ -316,6 +338,8 @@ def read_rgb(image: Path | Image.Image, *, as_stored: bool = False) -> NDArray[n
     else:
         pixels = _displayed(_decode(image.copy(), None, "colors"), _orientation(image))
     if pixels.dtype == np.uint16:
+        if not as_stored:  # not labels
+            _warn_of_range(image if isinstance(image, Path) else "image", int(pixels.max()))
         pixels = (pixels >> 8).astype(np.uint8)
     subject = image if isinstance(image, Path) else "image"
     is_usable = pixels.dtype == np.uint8 and pixels.shape[2:] in ((), (3,))

@@ -17,7 +17,7 @@ from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.io import pixel_files
 from tangent_train.io.camera_files import CameraFile, View
-from tangent_train.io.gpano import PanoramaArea, read_area, read_tags
+from tangent_train.io.gpano import Eye, PanoramaArea, eye_part, read_area, read_tags
 from tangent_train.io.videos import Frame
 from tangent_train.rendering import Blend, Interpolation, equirect_to_tangent
 from tangent_train.rendering.resampling import reduce_to_pitch
@@ -39,6 +39,7 @@ def read_placed(
     angles: Sequence[float] | None = None,
     frame: Frame | None = None,
     channel: str | None = None,
+    eye: Eye | None = None,
 ) -> tuple[NDArray[Any], PanoramaArea]:
     """Read a panorama of any dtype; place a part of a panorama on the whole sphere.
 
@@ -46,8 +47,9 @@ def read_placed(
         path: An image, an array or a video.
         interpolation: With ``nearest``, images with a palette give its indices.
         angles: See `read_area`.
-        frame: Frame of a video.
+        frame: Frame of a video, of one eye.
         channel: Channel of OpenEXR images, see `read_pixels`.
+        eye: Eye of a stereo image, see `eye_part`.
 
     Returns:
         ``(H, W)`` or ``(H, W, C)`` of the whole sphere, 0 outside of the part; and the part.
@@ -62,6 +64,7 @@ def read_placed(
     else:
         options: Any = {"indices": is_nearest, "in_srgb": not is_nearest, "channel": channel}
         image, tags = pixel_files.read_pixels(path, **options), read_tags(path)
+        image = image[eye_part(path, (image.shape[0], image.shape[1]), eye, angles, tags)]
     area = read_area(path, (image.shape[0], image.shape[1]), angles, tags=tags)
     return area.place(image), area
 

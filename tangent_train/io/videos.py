@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, of_extra
 from tangent_train.files import atomic_path, checked_file
-from tangent_train.io.gpano import PART_TAGS
+from tangent_train.io.gpano import PART_TAGS, tags_of
+from tangent_train.io.mp4_boxes import spherical_boxes
 from tangent_train.threads import in_threads
 
 _READERS = "mov,matroska,avi"
@@ -24,6 +25,7 @@ _MICROSECONDS = 10**6
 _MISSING_S = 0.5
 """Part of the declared duration that a whole video may lack: frames are not always as long."""
 
+_SHOWN_VP8 = 0x10
 _UPRIGHT_SIGNS = np.eye(2, dtype=np.int64)
 _SKEW = 0.02
 """Entries of a display matrix may differ from a quarter turn by this: one degree."""
@@ -33,7 +35,12 @@ _PQ, _HLG = 16, 18  # transfer functions of Rec. ITU-R BT.2100
 _SRGB: dict[str, Any] = {"dst_color_trc": 13, "dst_color_primaries": 1}
 _PROJECTIONS = {1: "a cube map", 3: "half a sphere", 5: "a fisheye picture"}
 _TILE = 2
-"""Values of FFmpeg's side data, ``AVSphericalProjection``."""
+_STEREO = dict.fromkeys(range(3, 8), "interleaved pictures of two eyes (stereo)")
+"""Values of FFmpeg's side data, ``AVSphericalProjection`` and ``AVStereo3DType``."""
+_HALVES = {(1, 0): "left-right", (1, 1): "right-left", (2, 0): "top-bottom", (2, 1): "bottom-top"}
+"""`StereoMode` by ``AVStereo3DType`` and inversion: the half of the left eye is named first."""
+_MODES = ("mono", *_HALVES.values())
+_WHOLE = (slice(None), slice(None))
 _AHEAD = 2
 _USUAL_RATE = 30
 _ENCODER = "libx264"
@@ -64,16 +71,18 @@ class Frame:
         time_s: Presentation time in seconds.
         picture: Frame of PyAV.
         display: How it is shown.
+        half: Rows and columns that are used: those of one eye.
     """
 
     number: int
     time_s: float
     picture: Any
     display: _Display
+    half: tuple[slice, slice] = _WHOLE
 
     def __call__(self) -> NDArray[np.uint8]:
         """Return upright RGB with square pixels, ``(H, W, 3)``."""
-        return _upright(self.picture, self.display)
+        return np.ascontiguousarray(_upright(self.picture, self.display)[self.half])
 
     @property
     def tags(self) -> dict[str, str]:
@@ -98,7 +107,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
                 end_s = max(end_s, float(end))
             if packet.stream == stream:
                 packets += packet.size > 0
-                times += [packet.pts] if packet.size and not packet.is_discard else []
+                times += [packet.pts] if packet.size and _is_shown(packet) else []
                 first = first or next(iter(packet.decode()), None)
         if first is None:
             raise DataError(path, found="no frame that can be decoded", expected="a whole video")
@@ -117,7 +126,7 @@ def read_video_tags(path: Path) -> dict[str, str]:
     """Return the spherical metadata of a video as GPano tags, see `tangent_train.io.gpano`.
 
     Returns:
-        Pose and area, as far as they are stated.
+        Pose, area and `StereoMode`, as far as they are stated.
 
     Raises:
         DataError: They name a layout that cannot be used, or the video cannot be decoded.
@@ -126,13 +135,19 @@ def read_video_tags(path: Path) -> dict[str, str]:
         return _tags(path, next(container.decode(stream)))
 
 
-def read_frames(path: Path, frames: int | None = None, every: int = 1) -> Generator[Frame]:
+def read_frames(
+    path: Path,
+    frames: int | None = None,
+    every: int = 1,
+    half: tuple[slice, slice] = _WHOLE,
+) -> Generator[Frame]:
     """Yield the first and then every n-th frame of a video, decoded in a thread a few ahead.
 
     Args:
         path: Video file.
         frames: Number of frames, see `read_video_size`; None to read it.
         every: Step n between frames.
+        half: Rows and columns of each frame that are used.
 
     Yields:
         Frames, which convert themselves to RGB when they are called.
@@ -154,7 +169,7 @@ def read_frames(path: Path, frames: int | None = None, every: int = 1) -> Genera
                 if number % every == 0:
                     late = float(number / (stream.average_rate or _USUAL_RATE))
                     time_s = late if picture.pts is None else picture.time
-                    yield Frame(number, time_s, picture, display)
+                    yield Frame(number, time_s, picture, display, half)
                 number += 1
         if number != expected:
             raise DataError(
@@ -200,6 +215,12 @@ def _file_url(path: Path) -> str:
     return f"file:{path.absolute()}"
 
 
+def _is_shown(packet: Any) -> bool:
+    """Return False for packets that an edit list hides and VP8 reference frames (RFC 6386, 9.1)."""
+    hidden = packet.stream.codec_context.name == "vp8" and not bytes(packet)[0] & _SHOWN_VP8
+    return not (packet.is_discard or hidden)
+
+
 def _display(path: Path, stream: Any, frame: Any) -> _Display:
     """Return how the frames of a video are shown, by its first frame.
 
@@ -231,12 +252,21 @@ def _display(path: Path, stream: Any, frame: Any) -> _Display:
 
 
 def _tags(path: Path, frame: Any) -> dict[str, str]:
-    """Return the tags of `read_video_tags`, from side data of the first frame."""
+    """Return the tags of `read_video_tags`, from side data of the first frame, and boxes."""
     data = {kind: frame.side_data.get(kind) for kind in ("SPHERICAL", "STEREO3D")}
     sphere, stereo = (
         np.frombuffer(bytes(found or bytes(32))[:32], np.int32).tolist() for found in data.values()
     )
-    if found := _PROJECTIONS.get(sphere[0]) or "pictures of two eyes (stereo)" * bool(stereo[0]):
+    boxes = spherical_boxes(path)
+    tags = tags_of(path, boxes.xml)
+    stated = boxes.mode or tags.pop("StereoMode", "").lower()
+    mode = stated or _HALVES.get((stereo[0], stereo[1] & 1), "mono")
+    found = _PROJECTIONS.get(sphere[0]) or _STEREO.get(stereo[0])
+    if boxes.projection or mode not in _MODES:
+        found = f"the projection {boxes.projection}" if boxes.projection else f"stereo of {mode}"
+    if tags.get("Stitched", "true").lower() not in ("true", "1"):
+        found = "pictures that are not stitched"
+    if found:
         raise DataError(
             path,
             found=f"a video with {found}, by its metadata",
@@ -244,13 +274,14 @@ def _tags(path: Path, frame: Any) -> dict[str, str]:
             remedy="Convert it, for example with FFmpeg's filter v360 or stereo3d. To remove "
             "wrong metadata: ffmpeg -i <video> -c copy <new>.mp4.",
         )
-    tags = {}
-    if data["SPHERICAL"]:
-        tags = {f"Pose{n}Degrees": str(sphere[k] / 2**16) for k, n in ((2, "Pitch"), (3, "Roll"))}
+    tags |= {} if mode == "mono" else {"StereoMode": mode}
+    if data["SPHERICAL"] and not boxes.xml:  # V1 has the direction of the first look, not the pose
+        tags["PosePitchDegrees"], tags["PoseRollDegrees"] = (str(n / 2**16) for n in sphere[2:4])
     if sphere[0] == _TILE:  # shares of the sphere that are cropped at its edges
         left, top, right, bottom = (n % 2**32 / 2**32 for n in sphere[4:])
         size = 2 * (1 - left - right), 1 - top - bottom
-        tags |= dict(zip(PART_TAGS, map(str, (2, 1, *size, 2 * left, top)), strict=True))
+        part = dict(zip(PART_TAGS, (2, 1, *size, 2 * left, top), strict=True))
+        tags |= {name: str(value) for name, value in part.items()}
     return tags
 
 
@@ -268,6 +299,7 @@ def write_video(
     size: tuple[int, int, int],
     paint: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]],
     every: int = 1,
+    half: tuple[slice, slice] = _WHOLE,
 ) -> None:
     """Write a video (H.264 in MP4) with size, rate and frame times of another one, without sound.
 
@@ -278,6 +310,7 @@ def write_video(
         paint: Function that returns a new frame ``(H, W, 3)`` for the number of a frame and the
             upright source frame; called in threads.
         every: Step n: the first and then every n-th frame is written.
+        half: See `read_frames`; `size` has its rows and columns.
 
     Raises:
         DataError: The source cannot be decoded.
@@ -311,7 +344,7 @@ def write_video(
         encoder.codec_context.time_base = stream.time_base
         encoder.codec_context.colorspace = encoder.codec_context.color_primaries = _BT709
         encoder.codec_context.color_trc = _BT709
-        read = read_frames(source, expected, every)
+        read = read_frames(source, expected, every, half)
         with closing(in_threads(painted, read, ahead=_AHEAD)) as frames:
             for frame in frames:
                 output.mux(encoder.encode(frame))

@@ -5,7 +5,7 @@ Arrays are sampled by `sample_map`, tensors by `tensors.render_tensor`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError, check_choice
+from tangent_train.errors import SettingError, check_choice, check_type
 from tangent_train.geometry import Angles, PinholeGrid, checked_rotation, perspective_grid
 from tangent_train.geometry.grids import Faces
 from tangent_train.rendering.resampling import Interpolation, Pixels, is_tensor, reduce_to_pitch
@@ -75,6 +75,7 @@ def equirect_to_tangent(
 
         return render_tensor(image, grid, faces, interpolation)
     check_panorama(image, interpolation)
+    check_grid(grid)
     if interpolation == "bilinear":
         image = reduce_to_pitch(image, min(grid.pitches))
     indices, (rows, columns) = grid.face_indices(faces), grid.size
@@ -297,14 +298,27 @@ def blend_of(blend: Blend, *, is_overlapping: bool) -> Blend:
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     """Return ``(H, W)`` as two integers; raise SettingError unless both are positive."""
+    check_type("shape", shape, Iterable, "(height, width)")
     whole = [isinstance(side, int | np.integer) and side > 0 for side in shape]
     if len(whole) != 2 or not all(whole):
         raise SettingError("shape", found=tuple(shape), expected="(height, width), both 1 or more")
     return int(shape[0]), int(shape[1])
 
 
+def check_array(name: str, images: object) -> None:
+    """Raise TypeError unless images are an array or a tensor."""
+    if not is_tensor(images):
+        check_type(name, images, np.ndarray, "a NumPy array or a torch tensor")
+
+
+def check_grid(grid: object) -> None:
+    """Raise TypeError unless a grid is one."""
+    check_type("grid", grid, PinholeGrid, "a grid, e.g. TangentGrid(base_level=1, level=9)")
+
+
 def check_panorama(image: Tensor | NDArray[np.generic], interpolation: str) -> None:
     """Raise SettingError unless a panorama, array or tensor, can be sampled."""
+    check_array("panorama", image)
     check_interpolation(interpolation)
     array = isinstance(image, np.ndarray)
     fits = image.ndim in (2, 3) and 0 not in image.shape if array else image.ndim >= 3

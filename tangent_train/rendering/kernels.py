@@ -605,6 +605,16 @@ def _add_to_tile(
 
 
 @njit_fast
+def _is_seen(owner: Array, covered: Array) -> bool:
+    """Return True if an image for which `covered` is True owns a pixel."""
+    for line in owner:
+        for image in line:
+            if covered[image]:
+                return True
+    return False
+
+
+@njit_fast
 def add_images(
     start: int,
     stop: int,
@@ -625,8 +635,8 @@ def add_images(
         canvas: Geometry of these images and the canvas.
         softmax: True to add probabilities. With owners, scores are interpolated first; with
             feathering, probabilities are interpolated.
-        total: ``(H, W, Kp)`` sums, changed. Empty to write only labels; then all images of a pixel
-            have to be added in one call.
+        total: ``(H, W, Kp)`` sums, changed. Empty to write only labels, of the pixels that these
+            images own; without owners, all images have to be added in one call.
         labels: ``(H, W)`` classes of the largest sums, written if `total` is empty.
     """
     num_classes, width = scores.shape[1], canvas.columns.shape[1]
@@ -637,8 +647,11 @@ def add_images(
     pixels = max(64, _TILE_SCORES // max(LANES, classes))
     buffers, patch = _tile_buffers(pixels), np.empty(0, np.float32)
     of_tile = np.empty(0, np.float32)
+    found = np.empty(width, labels.dtype)
     for tile in _tiles(start, stop, canvas, pixels):
         top, bottom, left, right = tile
+        if len(canvas.owner) > 0 and not _is_seen(canvas.owner[top:bottom, left:right], covered):
+            continue
         sums, step = total, (width, 0)
         if afterwards or len(total) == 0:
             high, wide = bottom - top, right - left
@@ -650,143 +663,12 @@ def add_images(
         patch = _add_to_tile(tile, scores, canvas, before, step, owns, buffers, patch, sums)
         if len(total) == 0:
             for i in range(top, bottom):
-                _write_classes(sums[i - top], num_classes, 0.0, -np.inf, labels[i, left:right])
+                _write_classes(sums[i - top], num_classes, 0.0, _LOWEST, found[: right - left])
+                for j in range(left, right):
+                    if len(canvas.owner) == 0 or covered[canvas.owner[i, j]]:
+                        labels[i, j] = found[j - left]
         elif afterwards:
             _add_probabilities(tile, covered, canvas.owner, num_classes, sums, total)
-
-
-@njit_fast
-def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Array) -> None:
-    """Write the best classes of a part of an image's scores.
-
-    Args:
-        scores: ``(K, h, w)`` scores of the image.
-        left: First column of the part.
-        top: First row of the part.
-        highest: ``(width,)`` buffer.
-        best: ``(height, width)`` class indices, written; −1 where a score is NaN or infinite, or
-            all are minus infinity.
-    """
-    width, last = best.shape[1], len(scores) - 1
-    total = np.empty(width, np.float32)
-    for y in range(len(best)):
-        highest[:], total[:], of_row = -np.inf, 0, best[y]
-        of_row[:] = 0
-        # Four classes at once need a quarter of the writes; the last one may be compared again.
-        for k in range(0, len(scores), 4):
-            second, third, fourth = min(k + 1, last), min(k + 2, last), min(k + 3, last)
-            p, q = scores[k, top + y], scores[second, top + y]
-            r, s = scores[third, top + y], scores[fourth, top + y]
-            for x in range(np.uint64(width)):
-                at = np.uint64(left) + x
-                a, b, c, d = p[at], q[at], r[at], s[at]
-                label = np.int32(k) if a > highest[x] else of_row[x]
-                most = a if a > highest[x] else highest[x]
-                label, most = np.int32(second) if b > most else label, b if b > most else most
-                label, most = np.int32(third) if c > most else label, c if c > most else most
-                of_row[x] = np.int32(fourth) if d > most else label
-                highest[x] = d if d > most else most
-                total[x] += (a + b) + (c + d)
-        for x in range(np.uint64(width)):
-            is_known = highest[x] > _LOWEST and total[x] < np.inf
-            of_row[x] = of_row[x] if is_known else -1
-
-
-@njit_fast
-def _interpolated_classes(
-    scores: Array, count: int, buffers: _TileBuffers, highest: Array, best: Array
-) -> None:
-    """Write classes of the largest interpolated scores; the first of equal ones.
-
-    Args:
-        scores: ``(K, h, w)`` scores of an image.
-        count: Number of pixels n.
-        buffers: Contains the pixels and their weights.
-        highest: Buffer.
-        best: Class indices of the pixels, written.
-    """
-    right, below = np.uint64(1), np.uint64(scores.shape[2])
-    highest[:count], best[:count] = -np.inf, len(scores)
-    for k in range(len(scores)):
-        plane, label = scores[k].reshape(-1), np.int32(k)
-        for p in range(np.uint64(count)):
-            at = np.uint64(buffers.first[p])
-            c, d = _bounded(plane[at + below]), _bounded(plane[at + below + right])
-            score = buffers.a[p] * _bounded(plane[at]) + buffers.b[p] * _bounded(plane[at + right])
-            score += buffers.c[p] * c + buffers.d[p] * d
-            better = score > highest[p]
-            best[p] = label if better else best[p]
-            highest[p] = score if better else highest[p]
-
-
-@njit_fast
-def _write_alike(
-    n: int, best: Array, corner: tuple[int, int], unknown: int, buffers: _TileBuffers, labels: Array
-) -> int:
-    """Write labels of pixels between four pixels of the image with the same best class.
-
-    Args:
-        n: Number of pixels.
-        best: Best classes of a part of the image, from `_best_of_part`.
-        unknown: Label of pixels of which one of the four has no class.
-        corner: Row and column of the part in the image.
-        buffers: The pixels; remaining pixels are moved to the front.
-        labels: Labels of the canvas, flat, written.
-
-    Returns:
-        Number of remaining pixels, which have to be interpolated.
-    """
-    flat, below = best.reshape(-1), np.uint64(best.shape[1])
-    remaining, right = 0, np.uint64(1)
-    for p in range(n):
-        at = np.uint64((buffers.row[p] - corner[0]) * best.shape[1] + buffers.column[p] - corner[1])
-        a, b, c, d = flat[at], flat[at + right], flat[at + below], flat[at + below + right]
-        is_known = min(a, b, c, d) >= 0
-        if a == b == c == d or not is_known:
-            labels[buffers.pixel[p]] = a if is_known else unknown
-            continue
-        buffers.pixel[remaining] = buffers.pixel[p]
-        buffers.column[remaining], buffers.row[remaining] = buffers.column[p], buffers.row[p]
-        buffers.right[remaining], buffers.below[remaining] = buffers.right[p], buffers.below[p]
-        remaining += 1
-    return remaining
-
-
-@njit_fast
-def label_images(
-    start: int, stop: int, scores: Array, canvas: CanvasGeometry, labels: Array
-) -> None:
-    """Write the best classes of the pixels that images own, in rows ``start:stop`` of a canvas.
-
-    Where the four pixels around a position have the same best class, it is also the best class of
-    the interpolated scores. Only the other positions are interpolated.
-
-    Args:
-        start: First row.
-        stop: One past the last row.
-        scores: ``(n, K, h, w)`` float32, h and w at least 2.
-        canvas: Geometry of these images and the canvas, with owners.
-        labels: ``(H, W)`` class indices, written.
-    """
-    side, width, pixels = (scores.shape[2], scores.shape[3]), labels.shape[1], _TILE_SCORES // LANES
-    buffers, owns = _tile_buffers(pixels), np.empty(_count(canvas), np.bool_)
-    highest, unlike = np.empty(max(side[1], pixels), np.float32), np.empty(pixels, np.int32)
-    best, flat = np.empty(0, np.int32), labels.reshape(-1)
-    for tile in _tiles(start, stop, canvas, pixels):
-        num_runs = _owned_runs(tile, canvas.owner, buffers.runs, owns)
-        for m in range(len(scores)):
-            if not owns[canvas.images[m]]:
-                continue
-            n = _list_pixels(m, side, canvas, num_runs, (width, 0), buffers)
-            top, left, high, wide = _split(n, side, buffers)
-            best = _at_least(best, high * wide)
-            part = best[: high * wide].reshape((high, wide))
-            _best_of_part(scores[m], left, top, highest[:wide], part)
-            n = _write_alike(n, part, (top, left), scores.shape[1], buffers, flat)
-            _weigh(n, (side[1], 0), buffers)
-            _interpolated_classes(scores[m], n, buffers, highest, unlike)
-            for p in range(n):
-                flat[buffers.pixel[p]] = unlike[p]
 
 
 @njit_fast

@@ -21,6 +21,8 @@ from tangent_train.geometry.coverage import check_coverage
 from tangent_train.rendering.forward import (
     Blend,
     blend_of,
+    check_array,
+    check_grid,
     check_images,
     check_interpolation,
     check_shape,
@@ -276,6 +278,8 @@ def tangent_to_equirect(
         SettingError: The images, the shape, the blend or the interpolation cannot be used, or the
             images do not cover the sphere.
     """
+    check_array("tangent images", images)
+    check_grid(grid)
     blend = blend_back(grid, blend)
     check_interpolation(interpolation, blend)
     shape = check_shape(shape)
@@ -318,6 +322,8 @@ def tangent_to_labels(
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
     """
+    check_array("scores", logits)
+    check_grid(grid)
     scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
     blend = blend_back(grid, blend)
     shape = check_shape(shape)

@@ -67,14 +67,10 @@ class NumbaSums:
         array = values.detach().float().contiguous().cpu().numpy()
         if not len(array):
             return
-        arguments: tuple[Any, ...]
-        if len(self.sums):
-            arguments = kernels.add_images, array, geometry, self._softmax, self.sums, _NO_LABELS
-        elif is_feathered:
-            arguments = kernels.add_images, array, geometry, False, NO_SUMS, self._labels
-        else:
-            arguments = kernels.label_images, array, geometry, self._labels
-        over_rows(arguments[0], *self._shape, *arguments[1:])
+        written = (self._softmax, self.sums, _NO_LABELS)
+        if not len(self.sums):
+            written = (False, NO_SUMS, self._labels)
+        over_rows(kernels.add_images, *self._shape, array, geometry, *written)
 
     def _owners(self, images: Views) -> NDArray[np.integer]:
         """Return the owner of each pixel, cached until images of another set are added."""

@@ -14,7 +14,7 @@ import torch
 from torch._compile import _disable_dynamo
 from torch.nn.functional import embedding_bag, grid_sample
 
-from tangent_train.rendering.forward import check_panorama
+from tangent_train.rendering.forward import check_grid, check_panorama
 from tangent_train.rendering.resampling import reduce_to_pitch
 from tangent_train.rendering.tables import Value, cached, map_dtype, positions_of_pixels
 
@@ -59,6 +59,7 @@ def render_tensor(
 ) -> Tensor:
     """Run `equirect_to_tangent` on a tensor."""
     check_panorama(image, interpolation)
+    check_grid(grid)
     if interpolation == "bilinear":
         image = reduce_to_pitch(image, min(grid.pitches))
     positions = _positions(grid, image, grid.face_indices(faces), interpolation)

@@ -1,1 +1,1 @@
-"""Results as JSON, CSV, Markdown, tables for the terminal, and pages."""
+"""Results as JSON, CSV, Markdown, tables for the terminal, charts and pages."""

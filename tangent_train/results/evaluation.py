@@ -43,7 +43,7 @@ class EvaluationResult:
         noun: Plural name of the images: panoramas, photos, shapes.
         images: Number of images.
         columns: Names and units of all scores, in the order of the tables.
-        scores: Scores over all images. The first is the main score, used by tables of latitudes.
+        scores: Scores over all images. The first is the main score, used by charts and latitudes.
         classes: Name (``class``) and scores of each class; empty without classes.
         latitude_bands: Edges ``latitude_deg`` (south, north) and scores of each band; empty for
             photos.

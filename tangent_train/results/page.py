@@ -56,8 +56,8 @@ class EncodedImage(NamedTuple):
         shares: ``(label, share of the truth, share of the prediction)`` of the labels that occur,
             the largest first, without shares of missing maps; by solid angle for panoramas.
         scale: Scale of the distances, see `pack_distances`; None for labels.
-        objects: Description of each object by its number, which is the green channel of the PNG of
-            predicted labels; None for a gray PNG.
+        objects: Row of each object in the table by its number, which is the green channel of the
+            PNG of predicted labels; None for a gray PNG.
     """
 
     name: str
@@ -72,7 +72,7 @@ class EncodedImage(NamedTuple):
     confidence: bytes | None = None
     shares: Sequence[Sequence[float]] = ()
     scale: Mapping[str, Any] | None = None
-    objects: Mapping[int, str] | None = None
+    objects: Mapping[int, Any] | None = None
 
 
 def encode_image(
@@ -84,7 +84,7 @@ def encode_image(
     truth: NDArray[Any] | None = None,
     confidence: NDArray[np.floating] | None = None,
     numbers: NDArray[np.integer] | None = None,
-    objects: Mapping[int, str] | None = None,
+    objects: Mapping[int, Any] | None = None,
     is_metric: bool = True,
     camera_matrix: NDArray[np.float64] | None = None,
     sphere: bool = True,
@@ -105,7 +105,7 @@ def encode_image(
         truth: True labels or distances ``(h, w)``; 0 and NaN are unknown.
         confidence: Confidence ``(h, w)`` of predicted labels, from 0 to 1.
         numbers: Numbers ``(h, w)`` of predicted objects, 0 for none; None without objects.
-        objects: Description of each object by its number; those above 255 are not shown.
+        objects: Row of each object in the table by its number; those above 255 are not shown.
         is_metric: True for distances in meters; False for distances up to a scale.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers, for points.
         sphere: True for a panorama.

@@ -109,7 +109,7 @@ class PredictionFolder:
         for kind in PICTURES:
             file = self.path / kind / f"{name}.mp4"
             if kind in self.kinds and not file.exists():
-                write_video(file, video.path, video.size, partial(painted, kind), every)
+                write_video(file, video.path, video.size, partial(painted, kind), every, video.part)
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv``, for labels ``classes.json``, and other tables.

@@ -1,16 +1,17 @@
-"""Report several evaluations: rows of scores as tables and files."""
+"""Report several evaluations: rows of scores as tables, files and a chart."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tangent_train.console import print_text
-from tangent_train.files import csv_text, write_text
+from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.metrics.scores import SOLID_ANGLE
+from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation import EvaluationResult
 from tangent_train.results.paired import Difference, difference
 from tangent_train.results.published import published_rows
@@ -49,6 +50,7 @@ class Report:
         compared: Explanation of the column "change"; empty without this column.
         cells: Cell of a row in a table of views and conditions, by the row's label. The table is
             written only if there are several conditions.
+        label: Returns the label of a row in the chart.
         base: Label of the row from which others differ, see `RunRow.difference`.
     """
 
@@ -57,6 +59,7 @@ class Report:
     notes: Sequence[str] = ()
     compared: str = ""
     cells: Mapping[str, Cell] = field(default_factory=dict)
+    label: Callable[[str], str] = str
     base: str = ""
 
     @property
@@ -164,7 +167,7 @@ class Report:
         return text(score.mean, interval=score.interval) + over_folds + over_seeds + count
 
     def write(self, folder: Path, name: str) -> None:
-        """Write the report as ``.md`` and ``.csv``, each atomically.
+        """Write the report as ``.md``, ``.csv`` and ``.png``, each atomically.
 
         Args:
             folder: Output folder.
@@ -174,6 +177,8 @@ class Report:
         lines = list(self.csv_lines())
         titles = list(dict.fromkeys(title for line in lines for title in line))
         write_text(folder / f"{name}.csv", csv_text(titles, lines))
+        rows = [replace(row, label=self.label(row.label)) for row in self.rows]
+        write_bytes(folder / f"{name}.png", report_png(self.title, rows, self.first))
 
     def csv_lines(self) -> Iterator[dict[str, Any]]:
         """Yield a line for each row, fold ("mean" over all folds), class or band, and score."""
@@ -285,7 +290,17 @@ def transfer_report(
     rows = [replace(row, partner=by_name.get(_photos_of(name))) for name, row in by_name.items()]
     compared = f"Change: from photos after the same fine-tuning, {_CHANGE}"
     compared *= any(row.partner for row in rows)
-    return Report("Transfer from photos to panoramas", rows, notes, compared, cells or {})
+    return Report("Transfer from photos to panoramas", rows, notes, compared, cells or {}, in_words)
+
+
+def in_words(stage: str) -> str:
+    """Return the data of a stage's test, the views or condition, and the fine-tuning.
+
+    >>> in_words("S-FT-10 (paper)"), in_words("S-erp"), in_words("P")
+    ('panoramas, epochs of fine-tuning: 10 (paper)', 'panoramas, erp', 'photos')
+    """
+    parts = {"P": "photos", "S": "panoramas", "FT": "epochs of fine-tuning:"}
+    return ", ".join(parts.get(part, part) for part in stage.split("-")).replace(":,", ":")
 
 
 def _photos_of(stage: str) -> str:

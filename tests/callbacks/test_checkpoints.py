@@ -84,8 +84,9 @@ def _from(folder: Path) -> dict[str, Any]:
     return {"ckpt_path": folder / "last.ckpt", "weights_only": True}
 
 
-@pytest.mark.parametrize("batch", [1, 3, 6])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    ("batch", "number"), [(1, signal.SIGTERM), (3, signal.SIGHUP), (6, signal.SIGTERM)]
+)
 def test_a_signal_amid_accumulated_batches_loses_nothing(
     batch: int, number: int, tmp_path: Path
 ) -> None:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.loggers import CSVLogger, WandbLogger
 from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import (  # type: ignore[import-untyped]
     EventAccumulator,
@@ -26,6 +26,7 @@ from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.loggers import start_loggers
 from tangent_train.callbacks.pictures import log_image
 from tangent_train.cli.run import Run
+from tangent_train.errors import SettingError
 from tangent_train.heads.pictures import prediction_panel
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import PixelTask
@@ -170,29 +171,75 @@ def test_hyperparameters_name_and_group_are_logged_once(
         assert "network.widths" in path.read_text()
 
 
-def _log(folder: Path, steps: range, *options: str, is_resumed: bool = False) -> None:
+def _log(folder: Path, steps: range, *options: str, checkpoint: Path | None = None) -> list[Any]:
     """Log a value at some steps, as a run that is then killed."""
     settings = composed_settings("train", *options)
-    hyperparameters = {"resumed": str(is_resumed)}  # MLflow refuses that they change
-    for logger in start_loggers(settings.logger, folder, hyperparameters, is_resumed=is_resumed):
+    hyperparameters = {"resumed": str(checkpoint)}  # MLflow refuses that they change
+    loggers = start_loggers(settings.logger, folder, hyperparameters, checkpoint)
+    for logger in loggers:
         for step in steps:
             logger.log_metrics({"train/loss": float(step), "only": 1.0 * step}, step)
         logger.save()
+    return loggers
 
 
 def test_a_resumed_run_is_one_run_in_every_logger(tmp_path: Path, monkeypatch: Any) -> None:
+    """It is killed at step 6, and resumed from a checkpoint of step 4."""
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "runs" / "mine" / "seed_0" / "P"
     folder.mkdir(parents=True)
-    _log(folder, range(4), "logger=many")
-    _log(folder, range(4, 8), "logger=many", is_resumed=True)
+    _log(folder, range(6), "logger=many")
+    checkpoint = folder / "last.ckpt"
+    torch.save({"global_step": 4}, checkpoint)
+    _log(folder, range(4, 8), "logger=many", checkpoint=checkpoint)
     expected = [(step, float(step)) for step in range(8)]
-    assert _of_csv(tmp_path)["train/loss"] == expected[:4], "Lightning begins a second file"
+    assert _of_csv(tmp_path)["train/loss"] == expected
     assert _of_tensorboard(tmp_path)[0]["train/loss"] == expected
     assert sorted(set(_of_mlflow(tmp_path)[0]["train/loss"])) == expected
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
-    assert len(list(tmp_path.rglob("version_*"))) == 2
+    assert len(list(tmp_path.rglob("version_*"))) == 1
+
+
+def test_a_logger_that_is_new_to_a_resumed_run_gets_its_settings(tmp_path: Path) -> None:
+    _log(tmp_path, range(4), "logger=tensorboard")
+    checkpoint = tmp_path / "last.ckpt"
+    torch.save({"global_step": 4}, checkpoint)
+    _log(tmp_path, range(4, 6), "logger=csv", checkpoint=checkpoint)
+    assert (tmp_path / "csv" / "version_0" / "hparams.yaml").is_file()
+    _log(tmp_path, range(4, 6), "logger=csv", checkpoint=checkpoint)
+    text = (tmp_path / "csv" / "version_0" / "metrics.csv").read_text()
+    rows = csv.DictReader(text.splitlines())
+    assert [row["step"] for row in rows] == ["4", "5"]
+
+
+def test_a_failing_logger_is_named_in_one_line(
+    tmp_path: Path, monkeypatch: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At the start it ends the command; later the training goes on."""
+    error = RuntimeError("404 Not Found\nmore")
+    mine = f"+logger.mine={{_target_: {__name__}.Refusing, save_dir: null}}"
+    monkeypatch.setattr(Refusing, "at_start", error)
+    with pytest.raises(SettingError, match=r"logger\.mine: found 404 Not Found; .*~logger\.mine"):
+        _log(tmp_path, range(2), "logger=csv", mine)
+    monkeypatch.setattr(Refusing, "at_start", None)
+    loggers = _log(tmp_path / "again", range(2), "logger=csv", mine)
+    assert len(loggers) == 2
+    found = capsys.readouterr().err
+    assert found.splitlines() == ["logger.mine logs nothing more: 404 Not Found"]
+
+
+class Refusing(CSVLogger):
+    """A logger whose server fails."""
+
+    at_start: Any = None
+
+    def log_hyperparams(self, params: Any = None) -> None:
+        if self.at_start is not None:
+            raise self.at_start
+
+    def log_metrics(self, *_: Any) -> None:
+        raise RuntimeError("404 Not Found\nmore")
 
 
 def test_the_same_images_are_shown_after_every_validation(

@@ -13,6 +13,7 @@ from hydra.core.singleton import Singleton
 
 from tangent_train.cli import transfer
 from tangent_train.errors import DataError, SettingError
+from tangent_train.results import report
 from tests.cli.rendering import Refused, render_with
 from tests.cli.tiny_runs import SETTINGS, Predict, Run, predicted, run_command, run_in
 from tests.inference.trained import write_checkpoint
@@ -27,7 +28,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 @pytest.fixture
 def stages(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stages of transfers, which are within Hydra, run in this process."""
+    """Stages of transfers, which are within Hydra, run in this process; no chart is drawn."""
 
     def run_process(line: Sequence[str]) -> int:
         state = Singleton.get_state()
@@ -37,6 +38,7 @@ def stages(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         return 0
 
     monkeypatch.setattr(transfer, "run_process", run_process)
+    monkeypatch.setattr(report, "report_png", lambda *_: b"a picture")
 
 
 @pytest.fixture

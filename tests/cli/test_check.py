@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tangent_train.cli.check import check
 from tangent_train.cli.prepare import prepare
+from tangent_train.io import pixel_files
+from tangent_train.io.pixel_files import write_pixels
 from tests.datamodules.data_files import save_tagged, write_png
 from tests.datamodules.folder.folder_format import save, write_classes
 from tests.running import Capture, composed_settings
@@ -54,28 +55,29 @@ def test_shares_and_classes_that_do_not_occur(root: Path, capsys: Capture) -> No
     assert "0 problems and 2 warnings; 3 panoramas of" in err
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_stereo_panoramas_are_among_the_problems(root: Path, capsys: Capture, suffix: str) -> None:
+def test_stereo_panoramas_are_among_the_problems(root: Path, capsys: Capture) -> None:
     """One picture with two halves of 180°, as its tags say, has the size of a panorama."""
     (root / "images" / "b.png").unlink()
-    save_tagged(root / "images" / f"b{suffix}", {"StereoMode": "left-right"}, (32, 64))
+    save_tagged(root / "images" / "b.jpg", {"StereoMode": "left-right"}, (32, 64))
     write_classes(root, [None, "door", "wall", "floor", "sofa"])
     with pytest.raises(SystemExit) as ended:
         _checked(root, capsys)
     assert ended.value.code
     out = " ".join(capsys.readouterr().out.split())
-    assert f"b{suffix} a stereo panorama (left-right), by its metadata" in out
+    assert "b.jpg a stereo panorama (left-right), by its metadata" in out
 
 
-def test_classes_of_other_labels(root: Path, capsys: Capture) -> None:
-    """By one off, almost everything is unknown."""
-    classes: dict[str, Any] = {"door": 11, "wall": 12, "floor": 13, "sofa": 4}
+def test_colors_of_12_bits_are_among_the_warnings(
+    root: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pixel_files, "_has_warned", bytearray(1))
+    monkeypatch.setenv("COLUMNS", "300")
+    write_pixels(root / "images" / "a.png", np.full((32, 64, 3), 4095, np.uint16))
+    classes = [None, "door", "wall", "floor", "sofa"]
     write_classes(root, classes)
-    _, err = _checked(root, capsys)
-    assert "Nothing is wrong" not in err
-    assert "Warning: 75.0 % of the pixels for train are unknown." in err
-    assert "Classes without a pixel for train: door, wall, floor (3 of 4)." in err
-    assert "Warning: 100.0 % of the pixels for test are unknown." in err
+    _out, err = _checked(root, capsys, "data.num_workers=0")
+    assert "a.png: the largest value of 16-bit colors is 4095" in err
+    assert "0 problems and 3 warnings; 3 panoramas of" in err
 
 
 def test_nothing_is_wrong(root: Path, capsys: Capture) -> None:

@@ -16,7 +16,6 @@ from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.metrics.scores import TURNS
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 from tests.inference.trained import (
-    ERP,
     TANGENT,
     sphere,
     write_checkpoint,
@@ -66,7 +65,6 @@ def test_a_run_is_evaluated_as_after_its_training(
     for number, changes in enumerate(
         (
             ["data.test_rotation=so3", "seed=1"],
-            ["data.test_rotation=so3", "seed=2"],
             ["representation=erp"],
             ["+representation.rotations=2"],
         )
@@ -107,24 +105,14 @@ def test_classes_that_a_map_lacks_are_missed_or_never_win(
     assert content["label_map"] == str(tmp_path / "map.json")
 
 
-@pytest.mark.parametrize(
-    ("typed", "expected"),
-    [
-        (["representation=erp"], ERP),
-        (["level=3"], TANGENT | {"level": 3}),
-        (
-            ["+representation.blend=feather", "+representation.base_level=1"],
-            TANGENT | {"base_level": 1, "blend": "feather"},
-        ),
-    ],
-)
 def test_the_file_gives_the_views_that_are_not_typed(
-    typed: list[str], expected: dict[str, Any], network: str, rooms: str, tmp_path: Path, run: Run
+    network: str, rooms: str, tmp_path: Path, run: Run
 ) -> None:
     given = _written(tmp_path / "map.json", MAP)
+    typed = "level=3", "+representation.blend=feather"
     run("evaluate", network, *ROOMS, rooms, given, *typed, "hydra.run.dir=out")
     section = _config("out")["representation"]
-    assert section == section | expected
+    assert section == section | TANGENT | {"level": 3, "blend": "feather"}
     assert results(tmp_path / "out")["images"] == 2
 
 
@@ -167,15 +155,9 @@ def test_an_exported_network_has_the_figures_of_its_run(
     ("changes", "message"),
     [
         ({"label_map": None}, r"found classes .*beam.*; expected .*dark.*label_map="),
-        (
-            {"label_map": {"classes": {"floor": ["pink"]}}},
-            "a map from dark, green, bright to beam",
-        ),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected 'unknown' or 'never'"),
         ({"task": "task=depth"}, "checkpoint: found a network that predicts pixel_classes"),
-        ({"data": "data=synthshapes"}, "data.inputs: found"),
         ({"optimizer": "optimizer.lr=1"}, "optimizer.lr: found a value; .*does not read it"),
-        ({"checkpoint": "checkpoint=none.onnx"}, r"checkpoint: found none\.onnx"),
     ],
 )
 def test_impossible_evaluations_are_refused(

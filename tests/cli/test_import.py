@@ -88,22 +88,7 @@ def test_weights_beside_an_onnx_file_are_written_into_it(here: Path, run: Run) -
         run("import", *OF_ONNX, "output=other.onnx")
 
 
-def test_an_import_without_a_trained_network_is_explained(here: Path, run: Run) -> None:
-    del here
-    with pytest.raises(
-        SystemExit, match=r"weights: .* a trained network.*Example: tangent-import library="
-    ):
-        run("import", "network=unet", "network.widths=[4,8]", "output=net.ckpt")
-
-
-def test_weights_of_another_network_are_one_line(here: Path, run: Run) -> None:
-    torch.save(UNet(3, 4, (4, 8)).state_dict(), here / "state.pt")
-    given = ("weights=state.pt", "classes=classes.json", "normalization=unit", "output=net.ckpt")
-    with pytest.raises(SystemExit, match=r"^tangent-import: state\.pt: found .*tensors of UNet.*$"):
-        run("import", "network=unet", "network.widths=[4,8,16]", *given)
-
-
-@pytest.mark.parametrize("size", [(48, 96), (96, 48), (32, 64), (20, 50)])
+@pytest.mark.parametrize("size", [(48, 96), (50, 20)])
 def test_a_file_for_images_that_are_not_square(
     size: tuple[int, int], here: Path, run: Run, capsys: Capture
 ) -> None:
@@ -191,14 +176,12 @@ OF_DEPTH = (
 )
 
 
-@pytest.mark.parametrize("squeezed", [True, False])
 def test_an_onnx_file_predicts_depth(
-    squeezed: bool, here: Path, run: Run, predict: Predict, capsys: Capture
+    here: Path, run: Run, predict: Predict, capsys: Capture
 ) -> None:
-    """Its output is ``(B, h, w)`` or ``(B, 1, h, w)``; predictions are resumed."""
-    after = [helper.make_node("Squeeze", ["linear", "axes"], ["scores"])] if squeezed else []
-    axes = {"axes": np.array([1])} if squeezed else {}
-    write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32), *after, **axes)
+    """Its output is ``(B, h, w)``; predictions are resumed."""
+    after, axes = helper.make_node("Squeeze", ["linear", "axes"], ["scores"]), np.array([1])
+    write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32), after, axes=axes)
     run("import", *OF_DEPTH, "image_size=32")
     printed = capsys.readouterr().out
     assert "MB\nthe network returns metric_z\n" in printed
@@ -221,13 +204,11 @@ def test_an_onnx_file_predicts_depth(
     ("given", "message"),
     [
         ((*OF_DEPTH, "unknown_classes=[sky]"), "unknown_classes: found .*nothing reads it"),
-        ((*OF_DEPTH[:-1], "depth=meters"), "depth: found meters; expected .*metric_z"),
         ((*OF_ONNX, "output=o.onnx", "depth=metric_z"), "classes: found .*nothing reads it"),
         (
             ("library=onnx", "file=net.onnx", *OF_DEPTH[2:]),
             r"found \(1, 4, 32, 32\).*depth with K = 1",
         ),
-        ((*OF_DEPTH, "model=net"), "model: found net; .*nothing reads it"),
     ],
 )
 def test_settings_of_depth_and_of_classes_exclude_each_other(
@@ -251,7 +232,6 @@ def _angles_deg(trained: LoadedNetwork) -> list[int]:
 @pytest.mark.parametrize(
     ("size", "levels", "side", "angles_deg"),
     [
-        ((384, 384), [9, 8], 384, [79, 118]),
         ((512, 1024), [10, 9], 1024, [96, 131]),
         ((480, 640), [9, 8], 640, [108, 140]),
     ],
@@ -334,19 +314,15 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
             ("classes=three.json",),
             "class names .*: found 3, .*expected names of 4 scores",
         ),
-        (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
         (
             ("unknown_classes=[sky]",),
             "unknown_classes sky; expected unknown_classes among background",
         ),
-        (("unknown_classes=[background,dark,green,bright]",), "; expected other classes besides"),
-        (("scores=softmax",), "scores: found softmax; expected"),
         (
             ("output=ours.ckpt",),
             r"output: found ours\.ckpt; expected .*\.onnx\. An ONNX network stays",
         ),
-        ((*TORCHVISION, "model=resnet50"), "model: found 'resnet50'; expected 'deeplabv3"),
         (
             (*TORCHVISION, "model=lraspp_mobilenet_v3_large", "weights=VOC"),
             "weights: found 'VOC'; expected 'COCO_WITH_VOC_LABELS_V1'",
@@ -357,8 +333,6 @@ def test_unusable_files_are_one_clear_message(
     changes: tuple[str, ...], message: str, here: Path, run: Run
 ) -> None:
     (here / "three.json").write_text(json.dumps(NAMES[1:]))
-    (here / "holes.json").write_text(json.dumps({"0": "wall", "2": "floor"}))
-    (here / "escapes.json").write_text(json.dumps([*NAMES[1:], "a\x1b[2J"]))
     before = set(here.iterdir())
     with pytest.raises(SystemExit, match=message):
         run("import", *(() if changes[0] in TORCHVISION else OF_ONNX), "output=ours.onnx", *changes)

@@ -116,12 +116,6 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
     assert "square.png: found 8 × 8 (width × height)" in capsys.readouterr().out
 
 
-def test_other_data_than_pairs(run: Run, tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match="SynthRooms; expected a data set of pairs:"):
-        run("data=synthrooms", "output=o")
-    assert not list(tmp_path.iterdir())
-
-
 def test_pycolmap_is_missed_before_any_work(run: Run, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     (tmp_path / "in").mkdir()

@@ -207,16 +207,8 @@ def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predi
     ("changes", "message"),
     [
         ({"input": "nowhere"}, "nowhere"),
-        ({"device": "abacus"}, "device"),
         ({"min_confidence": 70}, "min_confidence: found 70.* less than or equal to 1"),
         ({"fov": 70}, "fov: found 70.0; expected null: nothing reads it"),
-        ({"max_tilt_deg": 90}, "max_tilt_deg: found 90.0; expected 60: nothing reads it"),
-        ({"unmapped": "never"}, "unmapped: found never; expected unknown: nothing reads it"),
-        ({"align": "scale"}, "align: found scale; expected null: nothing reads it"),
-        (
-            {"projection": "perspective", "mask": -30},
-            r"mask: found \(-30.0,\); expected null: nothing",
-        ),
         ({"projection": "perspective", "rotations": 2}, "rotations: found"),
         ({"label_map": "night"}, "label_map: found 'night'; expected 'ade20k_to_cityscapes'"),
     ],

@@ -84,7 +84,12 @@ def test_objects_of_a_panorama(tmp_path: Path, network: Path, predict: Predict) 
     rgb, truth = scene()
     write_pixels(tmp_path / "in" / "hall.png", rgb)
     kinds = "[panoptic,labels,objects,overlay]"
-    entry = predict(checkpoint=network, write=kinds, trust=f"[{TRUST}]")["hall"]
+    distances = (1 + 0.5 * (truth % LABEL)).astype(np.float32)  # of each object another
+    distances[::2] = np.nan
+    (tmp_path / "distances").mkdir()
+    np.save(tmp_path / "distances" / "hall.npy", distances)
+    settings = {"write": kinds, "trust": f"[{TRUST}]", "depth": "distances"}
+    entry = predict(checkpoint=network, **settings)["hall"]
     output = tmp_path / "out"
     colors = read_pixels(output / "panoptic" / "hall.png", indices=False).astype(int)
     codes = colors @ [1, 256, LABEL]
@@ -119,15 +124,17 @@ def test_objects_of_a_panorama(tmp_path: Path, network: Path, predict: Predict) 
         assert lonlat_to_xyz(center) @ expected > np.cos(np.radians(1.5))
         assert float(row["width_deg"]) == pytest.approx(2 * radius, abs=3)
         assert float(row["score"]) == pytest.approx(0.9)
+        assert float(row["distance_m"]) == pytest.approx(1 + 0.5 * number, abs=0.002)
     assert entry["classes"]["wall"] < 1
     report = (output / "report.html").read_text()
-    assert "chair 1, score 0.90" in report
+    assert '"1":{"number":1,"class":"chair","score":0.9,' in report
 
 
 def test_python_returns_labels_and_objects(network: Path) -> None:
     rgb, truth = scene()
     loaded = tt.load(network, trust=TRUST)
-    codes, objects = loaded.panoptic(rgb)
+    codes, objects = loaded.panoptic(rgb, depth=np.full(SHAPE, 2.5))
+    assert {each["distance_m"] for each in objects} == {2.5}
     assert [each["class"] for each in objects] == [NAMES[disc[3]] for disc in DISCS]
     labels = loaded.labels(rgb)
     assert labels.dtype == np.uint8
@@ -166,4 +173,4 @@ def test_universal_networks_of_the_library(
     assert {int(row["number"]) for row in rows} == set(np.unique(numbers[numbers > 0]).tolist())
     assert {row["class"] for row in rows} == {"floor"}
     assert all(0.5 < float(row["score"]) <= 1 for row in rows)
-    assert "floor 1" in (tmp_path / "out" / "report.html").read_text()
+    assert '"1":{"number":1,"class":"floor",' in (tmp_path / "out" / "report.html").read_text()

@@ -255,6 +255,3 @@ def test_a_model_gives_poses_and_points_to_nerfstudio(
     order = np.argsort(cloud.vertices[:, 0])
     np.testing.assert_allclose(cloud.vertices[order], POINTS[np.argsort(POINTS[:, 0])], atol=1e-6)
     assert (cloud.colors[:, :3] == (10, 20, 30)).all()
-
-
-# Refused settings.

@@ -10,7 +10,7 @@ import pytest
 from tests.cli.tiny_runs import Run
 from tests.results.example_results import example_result, write_run
 
-FILES = {"report.md", "report.csv"}
+FILES = {"report.md", "report.csv", "report.png"}
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 from datamodules.core.inputs import RGB_NORMALIZATION
 from tangent_train.cli import transfer
 from tangent_train.errors import DataError, SettingError
+from tangent_train.results import report
 from tests.cli.pretended_runs import HERE, PretendedRuns, run_transfer
 from tests.inference.trained import write_checkpoint
 from tests.running import Capture, Patch
@@ -28,6 +29,7 @@ def runs(monkeypatch: Patch, tmp_path: Path) -> PretendedRuns:
     monkeypatch.setattr(transfer, "run_process", pretended)
     # Tested by itself, and slow.
     monkeypatch.setattr(transfer, "_check_data", lambda *_: None)
+    monkeypatch.setattr(report, "report_png", lambda *_: b"a picture")
     return pretended
 
 
@@ -55,7 +57,7 @@ def test_all_stages_run_in_order_and_the_tables_are_written(
     out = capsys.readouterr().out
     for number, stage in enumerate(STAGES, start=1):
         assert f"Stage {number} of 6, {stage} in {folder / stage}: tangent-" in out
-    assert {path.suffix for path in HERE.glob("transfer.*")} == {".md", ".csv"}
+    assert {path.suffix for path in HERE.glob("transfer.*")} == {".md", ".csv", ".png"}
     table = (HERE / "transfer.md").read_text()
     assert "| S-FT-1 | SynthRooms | 1 | 100.0 | +100.0 % | 100.0 | +100.0 % |" in table
     assert "| P | SynthRoomsPerspective | photos | 50.0 | – | 50.0 | – |" in table
@@ -160,7 +162,7 @@ def test_the_study_of_the_angular_resolution(runs: PretendedRuns) -> None:
     seen = [_seen(c, "level", "erp_height", "dim") for c in runs.configs.values()][1:]
     assert seen == [["Tang", 3, 16, 3], ["Tang", 4, 32, 6], ["Tang", 6, 64, 24]]
     files = {path.name for path in HERE.glob("angular_resolution.*")}
-    assert files == {f"angular_resolution.{suffix}" for suffix in ("md", "csv")}
+    assert files == {f"angular_resolution.{suffix}" for suffix in ("md", "csv", "png")}
     assert "from level 4" in (HERE / "angular_resolution.md").read_text()
 
 

@@ -222,6 +222,18 @@ def _box(name: bytes, *content: bytes) -> bytes:
 _SAMPLE_ENTRY = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"")
 
 
+def spherical_v1(tags: Mapping[str, str]) -> bytes:
+    """The box of Spherical Video V1."""
+    listed = "".join(f"<GSpherical:{name}>{v}</GSpherical:{name}>" for name, v in tags.items())
+    xml = (
+        '<?xml version="1.0"?><rdf:SphericalVideo'
+        ' xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"'
+        f' xmlns:GSpherical="http://ns.google.com/videos/1.0/spherical/">{listed}'
+        "</rdf:SphericalVideo>"
+    )
+    return _box(b"uuid", bytes.fromhex("ffcc8263f8554a938814587a02521fdd"), xml.encode())
+
+
 def insert_boxes(path: Path, new: bytes, parents: Sequence[bytes] = _SAMPLE_ENTRY) -> None:
     """Insert boxes at the end of a box of an MP4 file, whose moov box is its last."""
     data, place, starts = bytearray(path.read_bytes()), 0, []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,13 @@ from tangent_train.geometry import (
     PinholeGrid,
     RingGrid,
     TangentGrid,
+    camera_matrix_from_fov,
     equirect_directions,
+    equirect_solid_angles,
     lonlat_to_xyz,
 )
 from tangent_train.heads.objects import Objects, described, join_objects
+from tangent_train.inference.images import InputImage
 from tangent_train.metrics.panoptic import LABEL, panoptic_sums, quality
 from tangent_train.rendering.representations.views import PinholeViews
 
@@ -72,6 +76,10 @@ def panoptic(objects: Objects) -> NDArray[Any]:
     return label * LABEL + objects.numbers
 
 
+def panorama(shape: tuple[int, int]) -> InputImage:
+    return InputImage(np.zeros((*shape, 3), np.uint8))
+
+
 def truth(discs: Sequence[Any] = DISCS) -> NDArray[Any]:
     numbers = numbers_at(equirect_directions(SHAPE), discs)
     return np.array([0, *(disc[3] + 1 for disc in discs)])[numbers] * LABEL + numbers
@@ -122,7 +130,7 @@ def test_a_single_view_that_sees_an_object_is_outvoted() -> None:
 def test_no_objects() -> None:
     found = join_objects([seen(RINGS, [])], SHAPE)
     assert not found.numbers.any()
-    assert described(found, []) == []
+    assert described(found, [], panorama(SHAPE)) == []
 
 
 def test_scores_are_means_by_solid_angle() -> None:
@@ -136,11 +144,59 @@ def test_scores_are_means_by_solid_angle() -> None:
 def test_boxes_of_discs(disc: Any) -> None:
     longitude, latitude, radius, _ = disc
     numbers = numbers_at(equirect_directions((512, 1024)), [disc])
-    (entry,) = described(Objects(numbers, np.zeros(1, int), np.ones(1)), ["lamp"])
+    cap = 2 * np.pi * (1 - np.cos(np.radians(radius)))
+    objects = Objects(numbers, np.zeros(1, int), np.ones(1), np.array([cap]))
+    (entry,) = described(objects, ["lamp"], panorama((512, 1024)))
     center = lonlat_to_xyz(np.radians([entry["longitude_deg"], entry["latitude_deg"]]))
     assert center @ lonlat_to_xyz(np.radians([longitude, latitude])) > np.cos(np.radians(0.2))
     assert entry["width_deg"] == pytest.approx(2 * radius, abs=0.4)
     assert entry["height_deg"] == pytest.approx(2 * radius, abs=0.4)
-    cap = 2 * np.pi * (1 - np.cos(np.radians(radius)))
-    assert entry["solid_angle_sr"] == pytest.approx(cap, rel=0.02)
-    assert entry["class"] == "lamp"
+    (solid_angle,) = join_objects([seen(RINGS, [disc])], (512, 1024)).solid_angles
+    assert solid_angle == pytest.approx(cap, rel=0.03)
+    assert (entry["class"], entry["distance_m"]) == ("lamp", None)
+
+
+def test_distances_are_medians_by_solid_angle_of_the_known_pixels() -> None:
+    """A cap around the pole, whose distance grows with the angle from the pole."""
+    shape, radius = (512, 1024), np.radians(40)
+    numbers = numbers_at(equirect_directions(shape), [(0, 90, 40, 0)])
+    from_pole = np.arccos(equirect_directions(shape)[..., 2])
+    depth = np.rint(512 * (1 + from_pole)).astype(np.uint16)
+    depth[:, :600] = 0  # unknown
+    objects = Objects(numbers, np.zeros(1, int), np.ones(1), np.ones(1))
+    (entry,) = described(objects, ["lamp"], replace(panorama(shape), depth=depth))
+    half_of_the_cap = np.arccos((1 + np.cos(radius)) / 2)  # the rows alone would give 20°
+    assert entry["distance_m"] == pytest.approx(1 + half_of_the_cap, abs=0.01)
+    (entry,) = described(objects, ["lamp"], replace(panorama(shape), depth=0 * depth))
+    assert entry["distance_m"] is None
+
+
+def test_boxes_and_distances_of_photos() -> None:
+    """A wall at 2 m, 20° wide to the right of the optical axis."""
+    camera, size = camera_matrix_from_fov(90, (100, 200)), (100, 200)
+    tangent = (np.arange(200) - 99.5) / 100
+    numbers = np.zeros(size, np.int32)
+    numbers[49:51, (tangent > np.tan(np.radians(20))) & (tangent < np.tan(np.radians(40)))] = 1
+    depth = np.full(size, 2 * 512, np.uint16)
+    image = InputImage(np.zeros((*size, 3), np.uint8), depth, camera_matrix=camera)
+    objects = Objects(numbers, np.zeros(1, int), np.ones(1), np.ones(1))
+    (entry,) = described(objects, ["wall"], image)
+    assert entry["longitude_deg"] == pytest.approx(30, abs=0.3)
+    assert (entry["width_deg"], entry["height_deg"]) == pytest.approx((20, 1), abs=0.6)
+    half = np.arcsin(np.sin(np.radians([20, 40])).mean())  # of the solid angle of a row
+    assert entry["distance_m"] == pytest.approx(2 / np.cos(half), rel=0.003)
+
+
+def test_objects_outside_a_partial_panorama_are_left_out() -> None:
+    valid = np.zeros(SHAPE, np.bool_)
+    valid[:, 128:384] = True  # 90° to both sides
+    found = join_objects([seen(RINGS)], SHAPE, valid=valid)
+    inside = np.unique(truth()[valid])
+    assert len(found.scores) == len(inside[inside > 0])
+    assert not found.numbers[~valid].any()
+    whole = join_objects([seen(RINGS)], SHAPE)
+    is_chair = (panoptic(found) // LABEL == 2) & valid  # a disc far from the border
+    np.testing.assert_array_equal(is_chair, (panoptic(whole) // LABEL == 2) & valid)
+    per_pixel = equirect_solid_angles(SHAPE)[:, None] * np.ones(SHAPE)
+    sums = [per_pixel[found.numbers == k + 1].sum() for k in range(len(found.scores))]
+    np.testing.assert_allclose(found.solid_angles, sums)

@@ -29,9 +29,14 @@ def _features(images: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.concatenate([blurred, np.sin(3 * images[..., :2])], axis=-1).astype(np.float64)
 
 
-@pytest.mark.parametrize("grid", [TangentGrid(0, 5), TURNED, TangentGrid(2, 5)])
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
-@pytest.mark.parametrize("images_per_call", [1, 7, None])
+@pytest.mark.parametrize(
+    ("grid", "blend", "images_per_call"),
+    [
+        (TangentGrid(0, 5), "nearest", 1),
+        (TURNED, "feather", 7),
+        (TangentGrid(2, 5), "nearest", None),
+    ],
+)
 def test_results_are_those_of_all_images_at_once(
     grid: TangentGrid, blend: Blend, images_per_call: int | None
 ) -> None:
@@ -64,7 +69,7 @@ def test_images_are_passed_in_order_and_in_limited_number(
     np.testing.assert_array_equal(np.concatenate(seen), equirect_to_tangent(panorama, grid))
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.int64, bool])
+@pytest.mark.parametrize("dtype", [np.int64, bool])
 @pytest.mark.parametrize("channels", [(), (2,)])
 def test_labels_and_masks_are_copied_from_the_owner(dtype: Any, channels: tuple[int, ...]) -> None:
     grid, panorama = TangentGrid(1, 5), _smooth(33)

@@ -205,7 +205,7 @@ def far_image(distance: NDArray[np.float64], green: Any = 128) -> NDArray[np.uin
     return np.stack([red, np.broadcast_to(np.uint8(green), red.shape), red], axis=-1)
 
 
-@pytest.mark.parametrize("kind", ["metric_distance", "log_distance", "relative_disparity"])
+@pytest.mark.parametrize("kind", ["log_distance", "relative_disparity"])
 def test_a_predictor_aligns_what_its_network_scales(kind: DepthKind) -> None:
     directions = equirect_directions(SHAPE)
     image = InputImage(far_image(_truth(), 128 + 100 * directions[..., 1]))

@@ -49,7 +49,6 @@ CASES: dict[str, tuple[dict[str, Any], tuple[str, ...], InputImage, dict[str, An
     "equirectangular": (ERP, ("rgb", "depth"), _image(40, up=UP), {"rotations": 3}),
     "icosphere": (ICOSPHERE, ("rgb", "depth"), _image(40, up=UP), {"rotations": 2}),
     "on faces": (ICOSPHERE | {"elements": "faces"}, ("rgb", "elevation"), _image(32), {}),
-    "enlarged": (ERP, ("rgb", "elevation"), _image(12), {}),
     "photo": (PERSPECTIVE, ("rgb",), _photo(48), {}),
     "small photo": (PERSPECTIVE, ("rgb",), _photo(11), {"blend": "nearest"}),
 }

@@ -53,7 +53,7 @@ def _operations(monkeypatch: pytest.MonkeyPatch, count: int, **settings: Any) ->
 ON_TORCH = {"backend": "torch"}
 
 
-@pytest.mark.parametrize("count", [1, 13, 150])
+@pytest.mark.parametrize("count", [1, 150])
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 @pytest.mark.parametrize("views", [HORIZONTAL, TANGENT_20], ids=["16 horizontal", "20 tangent"])
 def test_a_panorama_takes_at_most_60_operations(

@@ -68,15 +68,10 @@ def test_pixels_are_at_the_positions_in_the_file(grid: PinholeGrid, tmp_path: Pa
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "other"}, "format"),
         ({"dim": 2}, "at least"),
-        ({"source": {"file": "a.png", "height": 0, "width": 4}}, "source.height"),
         ({"icosahedron_rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation"),
-        ({"views": []}, "views|stack"),
         ({"views": [[[1, 0, 0], [0, 1, 0], [0, 0, -1]]]}, "rotation"),
         ({"camera": CAMERA | {"matrix": (-9 * np.eye(3)).tolist()}}, "camera.matrix"),
-        ({"camera": CAMERA | {"matrix": [[]]}}, "camera.matrix"),
-        ({"images": [{"file": "a.png"}]}, "images"),
         ({"images": [{"file": "a.png", "face": 20}]}, "20"),
     ],
 )
@@ -96,10 +91,8 @@ def test_inconsistent_files_are_refused(
     "content",
     [
         None,
-        b"[]",
         b"\xff\xfe\x00",
         b'[{"cameras": [{"image_prefix": "a/", "ref_sensor": true}], "panoramas": {}}]',
-        b'[{"cameras": [], "panoramas": ["a.png"]}]',
         b'[{"cameras": [{"image_prefix": "a/", "world_from_camera": [1, 2]}], "panoramas": {}}]',
     ],
 )

@@ -83,7 +83,6 @@ def _ink_profile() -> bytes:
 
 _PROFILES = {
     "Display P3": _rgb_profile(((0.68, 0.32), (0.265, 0.69), (0.15, 0.06))),
-    "Adobe RGB": _rgb_profile(((0.64, 0.33), (0.21, 0.71), (0.15, 0.06))),
     "ProPhoto": _rgb_profile(
         ((0.7347, 0.2653), (0.1596, 0.8404), (0.0366, 0.0001)), (0.3457, 0.3585), 1.8
     ),
@@ -98,17 +97,14 @@ _COLORS = np.kron(np.random.default_rng(0).integers(20, 236, (4, 8, 3)), np.ones
 _SAVED: dict[str, tuple[str, dict[str, Any]]] = {
     "a.png": ("RGB", {}),
     "alpha.png": ("RGBA", {}),
-    "palette.png": ("P", {}),
     "a.jpg": ("RGB", {"quality": 90}),
     "a.tif": ("RGB", {"compression": "tiff_lzw"}),
     "a.webp": ("RGB", {"lossless": True}),
     "a.avif": ("RGB", {}),
     "a.heic": ("RGB", {}),
     "gray of colors.jpg": ("L", {}),
-    "gray.png": ("L", {}),
     "gray alpha.png": ("LA", {}),
     "inks.jpg": ("CMYK", {"quality": 95}),
-    "inks.tif": ("CMYK", {}),
 }
 
 
@@ -123,7 +119,9 @@ def _of_lcms(image: Image.Image, profile: bytes) -> NDArray[np.int16]:
 def test_embedded_profiles_are_converted_to_srgb(tmp_path: Path, name: str) -> None:
     mode, settings = _SAVED[name]
     kinds = [name.partition(".")[0].split()[0]]
-    kinds = kinds if kinds[0] in _PROFILES and "of colors" not in name else list(_PROFILES)[:5]
+    kinds = (
+        kinds if kinds[0] in _PROFILES and "of colors" not in name else ["Display P3", "swapped"]
+    )
     for kind in kinds:
         path = tmp_path / name
         Image.fromarray(_COLORS).convert(mode).save(path, icc_profile=_PROFILES[kind], **settings)
@@ -141,7 +139,7 @@ def test_embedded_profiles_are_converted_to_srgb(tmp_path: Path, name: str) -> N
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 @pytest.mark.parametrize("gamma", [1.0, 1.8])
 def test_profiles_of_16_bits(tmp_path: Path, suffix: str, gamma: float) -> None:
-    """Against the formula of sRGB (IEC 61966-2-1); they become 8 bits."""
+    """Against the formula of sRGB (IEC 61966-2-1)."""
     stored = np.random.default_rng(1).integers(0, 65536, (16, 32, 3)).astype(np.uint16)
     stored[:8] //= 32
     profile, path = _rgb_profile(gamma=gamma), tmp_path / f"a{suffix}"
@@ -150,12 +148,12 @@ def test_profiles_of_16_bits(tmp_path: Path, suffix: str, gamma: float) -> None:
     else:
         chunk = png_chunk(b"iCCP", b"test\0\0" + zlib.compress(profile))
         path.write_bytes(png_bytes(stored, before=chunk))
-    found = read_pixels(path, indices=False, in_srgb=True)
-    light = ((stored >> 8) / 255) ** gamma
+    light = (stored / 65535) ** gamma
     right = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
-    assert found.dtype == np.uint8
-    assert np.abs(found - right * 255).max() < 2.5
-    np.testing.assert_array_equal(read_rgb(path), found)
+    found = read_pixels(path, indices=False, in_srgb=True)
+    assert found.dtype == np.uint16
+    assert np.abs(found / 65535 - right).max() < 2 / 255
+    assert np.abs(read_rgb(path) - right * 255).max() < 2.5
     np.testing.assert_array_equal(read_pixels(path, indices=True), stored)
 
 
@@ -183,7 +181,10 @@ _DAMAGES = ("second half", "no end", "cut", "middle")
 
 @pytest.mark.parametrize(
     ("suffix", "damage"),
-    [*product((".jpg",), _DAMAGES), *product((".png", ".webp", ".heic"), _DAMAGES[2:3])],
+    [
+        *product((".jpg", ".png", ".avif"), _DAMAGES),
+        *product((".webp", ".heic"), _DAMAGES[:3]),  # without a checksum, some damage decodes
+    ],
 )
 def test_damaged_files_are_refused(tmp_path: Path, suffix: str, damage: str) -> None:
     path = tmp_path / f"a{suffix}"
@@ -194,7 +195,7 @@ def test_damaged_files_are_refused(tmp_path: Path, suffix: str, damage: str) -> 
     wrong = {
         "second half": content[:half] + bytes(len(content) - half),
         "middle": content[:half] + bytes(24) + content[half + 24 :],
-        "no end": content[:-2],
+        "no end": content[:-2] if suffix == ".jpg" else content[:-9],
         "cut": content[:half],
     }
     path.write_bytes(wrong[damage])

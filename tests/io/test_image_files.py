@@ -19,8 +19,8 @@ def _touch(*paths: Path) -> None:
 def test_a_folder_is_searched_for_images_only(tmp_path: Path) -> None:
     names = ["b.JPG", "a.png", "deep/er/c.TIFF", "deep/d.webp", "e.jpeg", "f.tif", "g.bmp", "h.GIF"]
     names += ["i.avif"] if features.check("avif") else []
-    names += ["phone.HEIC"]
-    others = ["raw.DNG", "notes.txt", ".hidden.jpg", ".thumbnails/a.jpg", "jpg", "deep/x.jpg.part"]
+    names += ["phone.HEIC", "deep/phone.jxl", "raw.DNG"]  # refused when they are read
+    others = ["notes.txt", ".hidden.jpg", ".thumbnails/a.jpg", "jpg", "deep/x.jpg.part"]
     others += ["escape.\x1b[2J", "._a.jpg", ".DS_Store", "Thumbs.db", "deep/desktop.ini"]
     others += ["@eaDir/a.jpg", "deep/@eaDir/d.webp/thumb.jpg"]
     _touch(*(tmp_path / name for name in names + others))
@@ -29,7 +29,7 @@ def test_a_folder_is_searched_for_images_only(tmp_path: Path) -> None:
     found = image_paths(tmp_path, tell=messages.append)
     assert found == sorted(tmp_path / name for name in names)
     assert image_paths(str(tmp_path)) == found
-    counts = r"Skipped: 1 .\x1b[2j, 1 .dng, 1 .part, 1 .txt, 1 without suffix. Convert"
+    counts = r"Skipped: 1 .\x1b[2j, 1 .part, 1 .txt, 1 without suffix. Convert"
     assert [text.partition(" images")[0] for text in messages] == [counts]
     image_paths(tmp_path / "*.png", tell=messages.append)
     assert len(messages) == 1
@@ -61,7 +61,6 @@ def test_patterns_select_images(tmp_path: Path) -> None:
     ("pattern", "found"),
     [
         ("nowhere.jpg", "found no such file or folder"),
-        ("*.txt", "found 1 files, none of them an image: 1 .txt"),
         ("notes", "found 2 files, none of them an image: 1 .pdf, 1 .txt"),
         ("empty", "found nothing"),
     ],
@@ -76,9 +75,7 @@ def test_missing_images_are_refused(tmp_path: Path, pattern: str, found: str) ->
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=rf"{re.escape(pattern)}: {found}.*\.webp") as caught:
         image_paths(tmp_path / pattern)
-    assert ("Convert images of other formats" in str(caught.value)) == (
-        "2 files" in found or "1 files" in found
-    )
+    assert ("Convert images of other formats" in str(caught.value)) == ("2 files" in found)
 
 
 def test_depth_is_found_by_the_name_of_the_image(tmp_path: Path) -> None:

@@ -14,12 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.io.gpano import PART_TAGS
+from tangent_train.io.gpano import PART_TAGS, read_area
 from tangent_train.io.videos import read_frames, read_video_size, read_video_tags, write_video
 from tests.datamodules.data_files import (
     hide_start,
     insert_boxes,
     projection_boxes,
+    spherical_v1,
     stereo_box,
 )
 
@@ -34,9 +35,8 @@ _CODECS: dict[str, tuple[str, str, dict[str, str]]] = {
     "forward": ("libx264", "yuv420p", {"bf": "0", "g": "6"}),
     "mpeg4": ("mpeg4", "yuv420p", {"bf": "2"}),
     "mjpeg": ("mjpeg", "yuvj420p", {}),
-    "ffv1": ("ffv1", "yuv420p", {}),
     "prores": ("prores_ks", "yuv422p10le", {}),
-    "vp8": ("libvpx", "yuv420p", {}),
+    "vp8": ("libvpx", "yuv420p", {"lag-in-frames": "16", "auto-alt-ref": "1"}),
     "vp9": ("libvpx-vp9", "yuv420p", {"lag-in-frames": "16"}),
     "av1": ("libsvtav1", "yuv420p", {"preset": "12"}),
     "opengop": ("libx264", "yuv420p", {"g": "6", "x264-params": "open-gop=1:scenecut=0"}),
@@ -95,23 +95,15 @@ def _read(path: Path) -> list[NDArray[np.uint8]]:
 _WHOLE = [
     ("x264.mp4", {}),
     ("x264.mov", {"times": _UNEVEN}),
-    ("x264.m4v", {}),
-    ("x264.mkv", {"sound": 3}),
     ("x264.avi", {"sound": 3}),
     ("x264.mp4", {"movflags": "frag_keyframe+empty_moov"}),
-    ("x264.mp4", {"times": range(50, 99)}),
     ("x264.mkv", {"live": "1"}),
     ("opengop.mkv", {}),
     ("mpeg4.avi", {"times": _UNEVEN}),
-    ("mjpeg.avi", {"frames": _pictures(1)}),
     ("mjpeg.mov", {}),
-    ("ffv1.mkv", {"times": _UNEVEN}),
     ("prores.mov", {}),
-    ("vp8.webm", {}),
     ("vp9.webm", {"times": _UNEVEN}),
-    ("av1.webm", {"frames": _pictures(1)}),
     ("av1.mp4", {"times": _UNEVEN}),
-    ("lossless.avi", {}),
 ]
 
 
@@ -126,8 +118,8 @@ def test_whole_videos_are_read(tmp_path: Path, name: str, settings: dict[str, An
     np.testing.assert_array_equal(every, _decoded(path)[::5])
 
 
-@pytest.mark.parametrize("codec", ["x264", "mpeg4", "mjpeg", "vp9", "opengop"])
-@pytest.mark.parametrize("hidden", [1, 5, 11])
+@pytest.mark.parametrize("codec", ["x264", "mjpeg", "opengop"])
+@pytest.mark.parametrize("hidden", [1, 11])
 def test_frames_that_an_edit_list_hides_do_not_count(
     tmp_path: Path, codec: str, hidden: int
 ) -> None:
@@ -163,9 +155,25 @@ def test_frames_that_need_what_was_cut_off_do_not_count(tmp_path: Path, suffix: 
     np.testing.assert_array_equal(_read(path), _decoded(path))
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-@pytest.mark.parametrize("quarter_turns", range(4))
-@pytest.mark.parametrize("mirrored", ["", "hflip", "vflip"])
+def _hide(path: Path, number: int) -> None:
+    """Make a frame of VP8 one that is not shown: bit 4 of its first byte (RFC 6386, 9.1)."""
+    with av.open(str(path)) as container:
+        packet = [bytes(packet) for packet in container.demux(video=0)][number]
+    hidden = bytes([packet[0] & ~0x10]) + packet[1:]
+    path.write_bytes(path.read_bytes().replace(packet, hidden))
+
+
+def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8")
+    _hide(path, 5)
+    assert len(_decoded(path)) == _COUNT - 1
+    np.testing.assert_array_equal(_read(path), _decoded(path))
+
+
+@pytest.mark.parametrize(
+    ("suffix", "quarter_turns", "mirrored"),
+    [(".mp4", 1, ""), (".mkv", 3, ""), (".mp4", 0, "hflip"), (".mkv", 1, "vflip")],
+)
 def test_frames_are_upright(tmp_path: Path, suffix: str, quarter_turns: int, mirrored: str) -> None:
     """Counterclockwise by quarter quarter_turns, and then mirrored."""
 
@@ -187,22 +195,19 @@ def test_frames_are_upright(tmp_path: Path, suffix: str, quarter_turns: int, mir
     assert np.abs(again - shown).mean() < 20  # compressed, with colors at half resolution
 
 
-@pytest.mark.parametrize("degrees", [3, 30, 45, 60, 100])
-def test_other_rotations_are_refused(tmp_path: Path, degrees: int) -> None:
-    path = _write(tmp_path / "a.mp4", setup=lambda stream: stream.set_display_rotation(degrees))
-    with pytest.raises(DataError, match=rf"a\.mp4: found a rotation by {degrees}°"):
+def test_other_rotations_are_refused(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mp4", setup=lambda stream: stream.set_display_rotation(30))
+    with pytest.raises(DataError, match=r"a\.mp4: found a rotation by 30°"):
         read_video_size(path)
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-@pytest.mark.parametrize("quarter_turns", [0, 1])
 @pytest.mark.parametrize(
-    ("stored", "aspect", "shown"),
+    ("suffix", "quarter_turns", "stored", "aspect", "shown"),
     [
-        ((64, 64), (2, 1), (64, 128)),
-        ((64, 128), (1, 2), (128, 128)),
-        ((64, 96), (4, 3), (64, 128)),
-        ((64, 128), (1001, 1000), (64, 128)),
+        (".mp4", 0, (64, 64), (2, 1), (64, 128)),
+        (".mkv", 1, (64, 128), (1, 2), (128, 128)),
+        (".mp4", 1, (64, 96), (4, 3), (64, 128)),
+        (".mkv", 0, (64, 128), (1001, 1000), (64, 128)),
     ],
 )
 def test_the_display_size_decides(
@@ -244,8 +249,12 @@ _PART = dict(zip(PART_TAGS, ("2", "1", "0.75", "0.75", "0.25", "0.25"), strict=T
         (_FLAT, dict.fromkeys(_POSE, "0.0")),
         (_TILE, _POSE | _PART),
         (stereo_box(0), {}),
-        (stereo_box(1), "pictures of two eyes"),
-        (stereo_box(2) + _TILE, "pictures of two eyes"),
+        (stereo_box(1), {"StereoMode": "top-bottom"}),
+        (stereo_box(2) + _TILE, {"StereoMode": "left-right"} | _POSE | _PART),
+        (stereo_box(4), {"StereoMode": "right-left"}),
+        (stereo_box(3), "stereo of mode 3"),
+        (projection_boxes(b"mshp"), "the projection mshp"),
+        (projection_boxes(b"cyli"), "the projection cyli"),
         (projection_boxes(b"cbmp"), "a cube map"),
     ],
 )
@@ -262,6 +271,41 @@ def test_layouts_that_the_metadata_state(
         return
     with pytest.raises(DataError, match=f"found a video with {tags}"):
         read_video_size(path)
+
+
+_HALF = dict(zip(PART_TAGS, ("256", "128", "128", "64", "64", "32"), strict=True))
+_STATED = {"Spherical": "true", "Stitched": "true", "ProjectionType": "equirectangular"}
+
+
+@pytest.mark.parametrize(
+    ("tags", "error"),
+    [
+        (_STATED | {"InitialViewPitchDegrees": "20"}, None),
+        (_STATED | _HALF, None),
+        (_STATED | {"StereoMode": "top-bottom"}, None),
+        (_STATED | {"StereoMode": "custom"}, "stereo of custom"),
+        (_STATED | {"Stitched": "false"}, "pictures that are not stitched"),
+    ],
+)
+def test_spherical_video_v1(tmp_path: Path, tags: dict[str, str], error: str | None) -> None:
+    """The first look of V1 is not the pose of the camera."""
+    path = _write(tmp_path / "a.mp4")
+    insert_boxes(path, spherical_v1(tags), (b"moov", b"trak"))
+    if error is None:
+        assert read_video_tags(path) == tags
+        area = read_area(path, (64, 128), tags=tags)
+        assert area.full_shape == ((128, 256) if _HALF.items() <= tags.items() else (64, 128))
+        return
+    with pytest.raises(DataError, match=f"found a video with {error}"):
+        read_video_size(path)
+
+
+@pytest.mark.parametrize("mode", ["left-right", "right-left", "top-bottom", "bottom-top"])
+def test_the_eyes_of_matroska(tmp_path: Path, mode: str) -> None:
+    def setup(stream: Any) -> None:
+        stream.metadata["stereo_mode"] = mode.replace("-", "_")
+
+    assert read_video_tags(_write(tmp_path / "a.mkv", setup=setup)) == {"StereoMode": mode}
 
 
 def _pq_nits(signal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -302,7 +346,6 @@ def test_high_dynamic_range_becomes_srgb(
     ("name", "settings"),
     [
         ("x264.mp4", {"movflags": "faststart"}),
-        ("x264.mkv", {}),
         ("vp9.webm", {}),
         ("mpeg4.avi", {}),
     ],
@@ -328,7 +371,7 @@ def _packets(path: Path) -> list[tuple[int, int]]:
         return [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
 
 
-@pytest.mark.parametrize("name", ["forward.mp4", "forward.mkv", "forward.avi", "av1.webm"])
+@pytest.mark.parametrize("name", ["forward.mp4", "forward.mkv", "av1.webm"])
 def test_a_damaged_frame_is_an_error_after_those_before(tmp_path: Path, name: str) -> None:
     path = _write(tmp_path / name, name.partition(".")[0])
     whole, data = _decoded(path), bytearray(path.read_bytes())
@@ -343,7 +386,11 @@ def test_a_damaged_frame_is_an_error_after_those_before(tmp_path: Path, name: st
     np.testing.assert_array_equal(kept, whole[: len(kept)])
 
 
-def test_another_number_of_frames(tmp_path: Path) -> None:
+def test_a_video_without_a_frame_and_another_number_of_frames(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8", _pictures(1))
+    _hide(path, 0)
+    with pytest.raises(DataError, match=r"a\.mkv: found no frame that can be decoded"):
+        read_video_size(path)
     with pytest.raises(DataError, match="12 of 13 frames"):
         list(read_frames(_write(tmp_path / "b.mkv"), _COUNT + 1))
 

@@ -134,14 +134,6 @@ def test_a_network_keeps_its_tensors_and_their_names() -> None:
         torch.testing.assert_close(same(images), network(images), rtol=0, atol=0)
 
 
-def test_convolutions_with_one_tap_are_not_changed() -> None:
-    network = nn.Sequential(nn.Conv2d(3, 4, 1), nn.Conv2d(4, 4, 3, padding=1))
-    converted: Any = make_distortion_aware(network)
-    images = torch.randn(1, 3, 8, 16)
-    assert type(converted[0]) is nn.Conv2d
-    assert torch.equal(converted[0](images), network[0](images))
-
-
 def test_a_network_without_such_convolutions_is_refused() -> None:
     class Standardized(nn.Conv2d):
         pass

@@ -23,7 +23,6 @@ from models import (
 from models.icosphere_unet import Pooling
 from models.mapped import vertex_means, vertex_parents
 from models.unet import Residual
-from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, rotation_about
 from tangent_train.geometry.icosphere import icosphere_directions
 from tests.tasks.small_networks import with_statistics
@@ -116,10 +115,3 @@ def test_pooled_vertices_are_the_mean_with_their_neighbors() -> None:
         expected = np.bincount(around, minlength=162) * 6 / len(around) / 7
         expected[vertex] = 1 / 7
         np.testing.assert_allclose(table[vertex], expected, atol=1e-12)
-
-
-def test_settings_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(SettingError, match=r"pooling: found max; expected first or mean .* vert"):
-        IcosphereUNet(3, 4, 1, mesh_operators, (4, 4), "max")
-    with pytest.raises(SettingError, match=r"unpooling: found zeros; expected repeat .* faces"):
-        IcosphereUNet(3, 4, 1, face_neighbors, (4, 4), "max")

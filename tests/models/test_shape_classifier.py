@@ -2,12 +2,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
 import torch
-from torch import nn
 
-from models import ShapeClassifier, widen_stem
-from tangent_train.errors import SettingError
+from models import ShapeClassifier
 from tests.tasks.small_networks import with_statistics
 
 
@@ -27,9 +24,3 @@ def test_scores_are_of_the_mean_over_views_and_positions() -> None:
         expected = network.head.weight @ features.mean(dim=(0, 2, 3)) + network.head.bias
         scores = network(torch.stack([other, shape.flip(0)]))
     torch.testing.assert_close(scores[1], expected, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("network", [nn.Conv2d(4, 2, 1), nn.Conv2d(3, 3, 1, groups=3)])
-def test_other_first_convolutions_are_refused(network: nn.Module) -> None:
-    with pytest.raises(SettingError, match=r"data\.inputs: found Conv2d.* of RGB images"):
-        widen_stem(network, 6)

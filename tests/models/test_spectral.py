@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,13 @@ from torch import Tensor
 
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.cli.run import build
-from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
 from tests.running import composed_settings
 from tests.tasks.small_networks import save_checkpoint
 
 torch_harmonics = pytest.importorskip("torch_harmonics")
 
-from models.harmonic_network import HarmonicNetwork, use_pixel_rows  # noqa: E402
+from models.harmonic_network import use_pixel_rows  # noqa: E402
 from models.zonal import ZonalClassifier, ZonalConvolution  # noqa: E402
 
 
@@ -71,12 +69,6 @@ def test_a_checkpoint_is_read_without_trust_and_works_in_mixed_precision(tmp_pat
     network: Any = load_network(tmp_path / "net.ckpt").network
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert network(torch.zeros(1, 4, 16, 32)).shape == (1, 13, 16, 32)
-
-
-def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch_harmonics.examples", None)
-    with pytest.raises(SettingError, match=r"network=SphericalUNet: .*'\.\[spectral\]'"):
-        HarmonicNetwork("SphericalUNet", 3, 5, 3, {})
 
 
 def functions_at(

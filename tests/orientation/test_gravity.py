@@ -88,10 +88,9 @@ def _up(*given: Any) -> NDArray[np.float64]:
     return up
 
 
-@pytest.mark.parametrize("shape", [(128, 256), (151, 303)])
 @pytest.mark.parametrize(
-    ("tilt_deg", "azimuth_deg", "yaw_deg"),
-    [(0, 0, 45), (3, 200, 180), (20, 0, 179), (44, 45, 3)],
+    ("shape", "tilt_deg", "azimuth_deg", "yaw_deg"),
+    [((128, 256), 0, 0, 45), ((151, 303), 20, 0, 179), ((128, 256), 44, 45, 3)],
 )
 def test_up_is_found_in_tilted_rooms(
     shape: tuple[int, int], tilt_deg: float, azimuth_deg: float, yaw_deg: float
@@ -100,7 +99,7 @@ def test_up_is_found_in_tilted_rooms(
     assert angle_deg(_up(draw_room(shape, rotation)), rotation[:, 2]) < 0.5
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_up_is_found_under_arbitrary_rotation(seed: int) -> None:
     rotation = random_rotation(np.random.default_rng(seed))
     assert angle_deg(_up(draw_room((128, 256), rotation), 180), rotation[:, 2]) < 0.5
@@ -152,9 +151,8 @@ def _without_structure() -> dict[str, NDArray[np.uint8]]:
 
 
 @pytest.mark.parametrize("name", list(_without_structure()))
-@pytest.mark.parametrize("max_tilt_deg", [45, 180])
-def test_images_without_structure_have_no_estimate(name: str, max_tilt_deg: float) -> None:
-    assert estimate_up(_without_structure()[name], max_tilt_deg) is None
+def test_images_without_structure_have_no_estimate(name: str) -> None:
+    assert estimate_up(_without_structure()[name], 180) is None
 
 
 def test_up_is_found_in_dark_rooms_with_missing_parts() -> None:

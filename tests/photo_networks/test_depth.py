@@ -65,15 +65,12 @@ def test_depth_is_that_of_the_library(family: Any, tmp_path: Path) -> None:
     ("config", "given", "expected"),
     [
         ({"model_type": "depth_anything"}, None, "relative_disparity"),
-        ({"model_type": "depth_anything"}, "relative_depth", "relative_depth"),
         (METRIC, None, "metric_z"),
         ({"model_type": "zoedepth"}, "metric_distance", "metric_distance"),
         ({"model_type": "depth_pro"}, None, "canonical_inverse"),
-        ({"model_type": "dpt"}, "relative_disparity", "relative_disparity"),
         (METRIC, "relative_disparity", "expected metric_z or metric_distance, because config.json"),
         ({"model_type": "depth_pro"}, "metric_z", "expected canonical_inverse, because config.js"),
         ({"model_type": "dpt"}, None, "depth: found none; expected log_dis.* Set depth=, e.g. rel"),
-        ({"model_type": "chmv2"}, "metric_z", "expected depth of photos, because config.json has"),
     ],
 )
 def test_the_config_determines_the_kind(config: Any, given: Any, expected: str) -> None:
@@ -100,17 +97,10 @@ def test_the_architecture_decides_if_transformers_has_both(tmp_path: Path) -> No
         kind(None, "DPTForSemanticSegmentation")
 
 
-@pytest.mark.parametrize(
-    ("changed", "expected"),
-    [
-        ({"depth_estimation_type": "squared"}, r"config\.json: found network cannot be built"),
-        ({"head_hidden_size": 9}, r"conv2\.\w+ of shape .* as described in config\.json\.$"),
-    ],
-)
-def test_configs_that_do_not_fit_are_refused(changed: Any, expected: str, tmp_path: Path) -> None:
+def test_a_config_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     saved(depth.depth_anything, tmp_path)
-    change_json(tmp_path / "config.json", **changed)
-    with pytest.raises(DataError, match=expected):
+    change_json(tmp_path / "config.json", depth_estimation_type="squared")
+    with pytest.raises(DataError, match=r"config\.json: found network cannot be built"):
         imported(tmp_path, depth="relative_disparity")
 
 

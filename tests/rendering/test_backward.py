@@ -54,8 +54,9 @@ def test_equal_infinite_and_nan_scores_have_defined_labels(blend: Any) -> None:
     assert (tangent_to_labels(scores, grid, (16, 32), blend) == 18).all()
 
 
-@pytest.mark.parametrize("num_classes", [1, 15, 16, 40, 257])
-@pytest.mark.parametrize("shape", [(9, 20), (70, 141)])
+@pytest.mark.parametrize(
+    ("num_classes", "shape"), [(1, (9, 20)), (15, (70, 141)), (40, (9, 20)), (257, (70, 141))]
+)
 def test_every_number_of_classes_works(num_classes: int, shape: tuple[int, int]) -> None:
     """The compiled kernel pads to 16; images may be finer or coarser than the panorama."""
     grid = TangentGrid(0, 4)
@@ -67,7 +68,7 @@ def test_every_number_of_classes_works(num_classes: int, shape: tuple[int, int])
     assert (labels == exact.numpy()).mean() > 0.999
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float32])
 @pytest.mark.parametrize("channels", [(), (2,)])
 @pytest.mark.parametrize(
     "way", [{"blend": "nearest"}, {"blend": "feather"}, {"interpolation": "nearest"}]
@@ -110,7 +111,6 @@ def test_gradients_agree_with_finite_differences(blend: Any) -> None:
     [
         (torch.zeros(19, 1, 16, 16), (8, 16), "nearest", r"expected \(..., 20, channels, 16, 16\)"),
         (torch.zeros(20, 1, 16, 16, dtype=torch.int64), (8, 16), "nearest", "int64"),
-        (torch.zeros(20, 1, 16, 16), (0, 16), "nearest", "shape"),
         (torch.zeros(20, 1, 16, 16), (8, 16), "linear", "blend"),
     ],
 )

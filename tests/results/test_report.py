@@ -14,6 +14,7 @@ from datamodules.modelnet40.shapes import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.files import write_text
 from tangent_train.heads import ClassesHead, DistanceHead, ImageClassHead
+from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation import EvaluationResult, load_result
 from tangent_train.results.published import (
     facts,
@@ -23,6 +24,7 @@ from tangent_train.results.published import (
 )
 from tangent_train.results.report import Report, levels_report, runs_report, transfer_report
 from tangent_train.results.rows import RunRow
+from tests.decoded import decoded
 from tests.results.example_results import PROTOCOL, example_result, without_solid_angle
 
 REAL = CLASSES
@@ -244,6 +246,18 @@ def test_levels_are_compared_with_the_level_of_the_photos() -> None:
         ("level 7", "–"),
         ("level 8", "−50.0 %"),
     ]
+
+
+def test_the_chart_shows_a_bar_of_the_right_height() -> None:
+    def blue_rows(share: float) -> int:
+        result = example_result([share] * 3)
+        rows = [RunRow.of("$a$ " * 30, [result], {})]
+        blue = (decoded(report_png("Report", rows, result)) == (0x00, 0x72, 0xB2)).all(-1)
+        return int(blue.any(1).sum())
+
+    low, middle, high = map(blue_rows, (0.0, 0.4, 0.8))  # two rows of axes, the legend's handle
+    assert high - middle == pytest.approx(middle - low, abs=8)
+    assert high - low > 200
 
 
 def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> None:

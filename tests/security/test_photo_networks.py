@@ -41,9 +41,7 @@ def test_an_image_processor_runs_and_fetches_nothing(folder: Path, tmp_path: Pat
     assert happened == []
 
 
-@pytest.mark.parametrize(
-    "size", [{"height": 10**9, "width": 1}, {"height": 31623, "width": 31623}, 10**9], ids=str
-)
+@pytest.mark.parametrize("size", [{"height": 31623, "width": 31623}, 10**9], ids=str)
 def test_an_image_processor_of_huge_images_is_refused(folder: Path, size: Any) -> None:
     networks.change_json(folder / "preprocessor_config.json", size=size)
     with pytest.raises(DataError, match=r"preprocessor_config\.json: found an image size of 1?3?"):
@@ -62,12 +60,9 @@ def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:
     [
         _GPT2,
         {"model_type": "timm_backbone", "backbone": f"hf-hub:{CANARY}/x"},
-        {"model_type": "timm_backbone", "backbone": f"local-dir:{CANARY}"},
         # A class whose own network inside is of another kind than it declares.
         {"model_type": "sam3", "vision_config": _GPT2},
         {"model_type": "dpt", "backbone": "gpt2", "use_timm_backbone": False},
-        {"model_type": CANARY, "auto_map": {"AutoConfig": f"{CANARY}--x.Config"}},
-        {"backbone": "gpt2"},
         "gpt2",
     ],
 )

@@ -30,8 +30,7 @@ class Labeler(nn.Module):
         return back, tt.tangent_to_labels(scores, self.grid, (32, 64), self.blend)
 
 
-@pytest.mark.parametrize("blend", ["feather", "nearest"])
-@pytest.mark.parametrize("angle", [None, 0.7])
+@pytest.mark.parametrize(("angle", "blend"), [(None, "feather"), (0.7, "nearest")])
 def test_a_compiled_network_has_the_same_results_and_gradients(
     angle: float | None, blend: str
 ) -> None:

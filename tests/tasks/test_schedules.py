@@ -84,20 +84,18 @@ def test_a_resumed_schedule_continues_as_if_it_had_not_stopped(name: str, tmp_pa
 @pytest.mark.parametrize(
     ("schedule", "length"),
     [
-        (Schedule(partial(lr_scheduler.OneCycleLR, max_lr=LR, total_steps=_NULL), "step"), 6),
         (Schedule(partial(warmup_cosine, total_steps=_NULL), "step"), 6),
         (partial(lr_scheduler.CosineAnnealingLR, T_max=2), 2),
     ],
 )
-@pytest.mark.parametrize("longer", [1, 3])
 def test_a_schedule_with_an_end_is_not_resumed_for_another_length(
-    schedule: Any, length: int, longer: int, tmp_path: Path
+    schedule: Any, length: int, tmp_path: Path
 ) -> None:
     """Before the first step; with the same length, a finished training resumes."""
     _train(tmp_path, schedule, max_epochs=2)
     assert _train(tmp_path, schedule, resume=True, max_epochs=2) == []
     with pytest.raises(SettingError, match=f"found .*; expected {length}, when resuming"):
-        _train(tmp_path, schedule, resume=True, max_epochs=longer)
+        _train(tmp_path, schedule, resume=True, max_epochs=3)
 
 
 def test_the_number_of_warm_up_steps_is_rounded() -> None:
@@ -137,7 +135,7 @@ class Scores(lightning.Callback):
         pl_module.log("val/made", float(trainer.current_epoch == 1))
 
 
-@pytest.mark.parametrize("until", [3, 4, 5])
+@pytest.mark.parametrize("until", [3, 5])
 def test_a_plateau_is_resumed_exactly(until: int, tmp_path: Path) -> None:
     plateau: Any = partial(lr_scheduler.ReduceLROnPlateau, mode=_NULL, factor=0.5, patience=1)
     schedule = Schedule(plateau, monitor="val/made")
@@ -156,9 +154,3 @@ def test_a_plateau_is_stepped_after_every_nth_epoch(tmp_path: Path) -> None:
     more: dict[str, Any] = {"limit_val_batches": 1, "max_epochs": 6, "check_val_every_n_epoch": 2}
     rates = _train(tmp_path, schedule, **more)
     assert rates[::STEPS] == pytest.approx([LR, LR, LR, LR, LR / 2, LR / 2])
-
-
-def test_a_plateau_of_an_unknown_score_is_refused(tmp_path: Path) -> None:
-    scheduler = Schedule(partial(lr_scheduler.ReduceLROnPlateau, mode="min"), monitor="val/none")
-    with pytest.raises(SettingError, match=r"scheduler\.monitor: found val/none; expected one of "):
-        _train(tmp_path, scheduler, max_epochs=1)

@@ -1,5 +1,5 @@
 // Mouse and fingers on the picture: drag, with the right button or two fingers too, pinch, wheel,
-// double click.
+// click, double click.
 
 class Gestures {
   constructor(viewer) {
@@ -8,7 +8,7 @@ class Gestures {
     this.pressed = new Map(); // fingers, or the mouse, by the browser's number
     this.pointer = null; // where something points, for the readout
     const types = ["pointerdown", "pointermove", "pointerup", "pointercancel", "pointerleave"];
-    for (const type of [...types, "dblclick"]) {
+    for (const type of [...types, "click", "dblclick"]) {
       this.canvas.addEventListener(type, (event) => this[type](event));
     }
     this.canvas.addEventListener("contextmenu", (event) => {
@@ -24,7 +24,8 @@ class Gestures {
 
   pointerdown(event) {
     if (event.button !== 0 && !(event.button === 2 && this.viewer.inPoints)) return;
-    this.pressed.set(event.pointerId, this.position(event));
+    this.start = this.position(event);
+    this.pressed.set(event.pointerId, this.start);
     this.canvas.setPointerCapture(event.pointerId);
     this.canvas.classList.add("grabbed");
   }
@@ -74,6 +75,14 @@ class Gestures {
     const pixels = event.deltaY * (event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 30 : 1);
     const factor = Math.exp(-clamp(pixels, -240, 240) / 500);
     this.viewer.view.zoom(factor, ...this.position(event));
+    this.viewer.redraw();
+  }
+
+  click(event) {
+    this.pointer = this.position(event); // a tap does not move
+    const [x, y] = this.pointer;
+    const isDrag = Math.hypot(x - this.start[0], y - this.start[1]) > 4;
+    if (!isDrag) this.viewer.showObject(x, y);
     this.viewer.redraw();
   }
 

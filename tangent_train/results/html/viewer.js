@@ -92,6 +92,7 @@ class Viewer {
     this.offerLayers();
     this.offerProjections();
     this.fillLegend();
+    this.find(".object").replaceChildren();
     this.redraw();
   }
 
@@ -257,10 +258,20 @@ class Viewer {
     if (!bytes) return null;
     if (kind === "confidence") return `${kind}: ${Math.round(bytes[0] / 2.55)} %`;
     const object = kind === "prediction" && this.data.objects?.[bytes[1]];
-    if (object) return `${nameOf(kind)}: ${object}`;
+    if (object) return `${nameOf(kind)}: ${object.class} ${object.number}`;
     if (!this.distances) return `${nameOf(kind)}: ${this.classes[bytes[0]]?.name ?? bytes[0]}`;
     const log = this.distances.log(bytes[0], bytes[1]);
     return `${nameOf(kind)}: ${log === null ? "unknown" : this.distances.text(Math.exp(log))}`;
+  }
+
+  // Show the row of the object at a pixel of the canvas in the table of objects, or nothing.
+  showObject(x, y) {
+    const objects = this.data?.objects;
+    const at = objects && this.view.locate(x, y);
+    const row = at && objects[this.surface.valueAt("prediction", at)[1]];
+    const cell = (kind, text) => Object.assign(document.createElement(kind), { textContent: text });
+    const cells = ([name, value]) => [cell("dt", name), cell("dd", value ?? "unknown")];
+    this.find(".object").replaceChildren(...Object.entries(row ?? {}).flatMap(cells));
   }
 
   // Events ------------------------------------------------------------------------------------
@@ -329,7 +340,7 @@ class Viewer {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const elsewhere = event.target !== this.canvas;
     if (event.target.matches("select, input[type=range]")) return;
-    if (elsewhere && event.key.startsWith("Arrow")) return; // moves between radio buttons
+    if (elsewhere && /^(Arrow|Enter)/.test(event.key)) return; // of radio buttons and buttons
     const { view } = this;
     const step = view.half / 8;
     const drag = event.shiftKey ? "shift" : "pan";
@@ -343,6 +354,7 @@ class Viewer {
       "-": () => view.zoom(0.8),
       0: () => view.reset(),
       Home: () => view.reset(),
+      Enter: () => this.showObject(...view.canvas.map((side) => side / 2)),
       PageUp: () => this.neighbor(-1),
       PageDown: () => this.neighbor(1),
       f: () => this.fullScreen(),

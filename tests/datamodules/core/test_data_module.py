@@ -20,7 +20,6 @@ from datamodules.core.files import SPLITS, ImageFiles
 from datamodules.core.label_map import class_weights
 from datamodules.core.loading import EpochSampler
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
-from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
 from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of
@@ -231,11 +230,6 @@ def test_weights_are_those_of_the_formulas() -> None:
         assert weights.dtype == np.float32
 
 
-def test_weights_without_labels_or_weighting() -> None:
-    assert class_weights(np.array([0, 0]), "sqrt").tolist() == [0, 0]
-    assert class_weights(np.array([7, 0]), "none").tolist() == [1, 1]
-
-
 def _indices(sampler: EpochSampler) -> list[int]:
     return [index for _, index in sampler]
 
@@ -250,11 +244,6 @@ def test_shuffled_order_is_new_every_epoch_and_reproducible() -> None:
     assert sorted(first) == sorted(_indices(sampler)) == list(range(20))
     assert first != _indices(sampler) != list(range(20))
     assert _indices(EpochSampler(20, 8)) != first
-
-
-def test_fewer_samples_than_processes_are_refused() -> None:
-    with pytest.raises(SettingError, match="2 processes for 1 samples"):
-        EpochSampler(1, 0, rank=0, world_size=2)
 
 
 def test_a_resumed_epoch_goes_on_behind_what_was_had() -> None:

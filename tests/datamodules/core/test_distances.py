@@ -18,14 +18,12 @@ from datamodules.core.image_module import ImageDataModule, PhotoDataModule
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.folder.labeled import FolderPanoramas
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
-from datamodules.synthia.omnisynthia import SynthiaPerspective
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.conftest import fabricate
 from tests.datamodules.data_files import read_png, write_png
 from tests.datamodules.folder.folder_format import save, write_data_set
-from tests.datamodules.synthia_format import write_views
 
 _AREAS = dict.fromkeys(("1", "2", "3", "4", "5a", "5b", "6"), ("office_1",))
 UNEVEN = EquirectRepresentation(3, crop_deg=90, erp_height=16)
@@ -61,13 +59,6 @@ SOURCES = {
     "stanford2d3ds_perspective": Source(
         *(Stanford2D3DSPerspective, lambda root: fabricate(root, _AREAS, photos=1)),
         "area_*/data/depth/*.png",
-    ),
-    "synthia_perspective": Source(
-        *(
-            SynthiaPerspective,
-            lambda root: write_views(root, dict.fromkeys(("01", "02", "04", "05", "06"), 2)),
-        ),
-        "*/Depth/Stereo_Left/*/*.png",
     ),
 }
 
@@ -207,7 +198,6 @@ def test_unlikely_depth_is_warned_of_and_counted(tmp_path: Path) -> None:
     [
         (Cityscapes, {}, "data.labels: found distance; .*disparities are not read"),
         (Stanford2D3DS, {"inputs": ["rgb", "depth"]}, "data.inputs: .*no depth: it is the target"),
-        (Stanford2D3DS, {"classes": 8}, "data.classes: found 8; expected null"),
     ],
 )
 def test_settings_without_a_meaning_for_distances_are_refused(

@@ -59,10 +59,8 @@ def test_a_data_set_is_its_files_and_classes(tmp_path: Path) -> None:
     ("settings", "message"),
     [
         ({"inputs": ["rgb", "sound"]}, "data.inputs: found sound; expected 'rgb', 'depth' or"),
-        ({"test_rotation": "yaw"}, "data.test_rotation: found yaw"),
         ({"classes": 4}, "data.classes: found 4; expected 3"),
         ({"colour": 1}, "data.colour: found 1; expected a known setting"),
-        ({"level": 3}, "data.level: found 3; expected null"),
     ],
 )
 def test_settings_are_checked_by_their_types(

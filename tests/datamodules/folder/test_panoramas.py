@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +62,7 @@ def _test_labels(root: Path, erp: Any) -> NDArray[np.uint8]:
     return FolderPanoramas(root, erp).dataset("test").read(0).labels
 
 
-@pytest.mark.parametrize(("colors", "transparent"), [(4, False), (16, True), (256, True)])
+@pytest.mark.parametrize(("colors", "transparent"), [(4, False), (256, True)])
 def test_palettes_are_entries_or_colors(
     tmp_path: Path, erp: Any, colors: int, transparent: bool
 ) -> None:
@@ -72,7 +71,7 @@ def test_palettes_are_entries_or_colors(
     palette = np.stack((*np.divmod(np.arange(colors), 16), np.full(colors, 200)), -1)
     image = Image.fromarray(stored, "P")
     image.putpalette(palette.astype(np.uint8).tobytes())
-    settings: dict[str, Any] = {"bits": {4: 2, 16: 4, 256: 8}[colors]}
+    settings: dict[str, Any] = {"bits": {4: 2, 256: 8}[colors]}
     if transparent:
         settings["transparency"] = bytes(range(colors))
     _one_panorama(tmp_path, image, {"one": 1, "two": 2, "three": 3}, **settings)
@@ -142,7 +141,7 @@ def _write_accents(root: Path) -> None:
         save(root / "masks" / f"{name}.png", np.ones((16, 32), np.uint8))
 
 
-@pytest.mark.parametrize("forms", list(product((NFC, NFD), repeat=5)))
+@pytest.mark.parametrize("forms", [(NFC, NFD, NFC, NFD, NFD), (NFD, NFC, NFD, NFC, NFC)])
 def test_names_that_look_the_same_are_the_same(
     tmp_path: Path, erp: Any, forms: tuple[str, ...]
 ) -> None:

@@ -110,7 +110,6 @@ def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
     "value",
     [
         [[70, 2, 30], [0, 72, 20], [0, 0, 1]],
-        [[float("nan"), 0, 30], [0, 72, 20], [0, 0, 1]],
         {"fx": 70, "fy": 72, "cx": 30, "cy": 20, "k1": 0.1},
     ],
 )

@@ -43,7 +43,7 @@ def _triangle(image: NDArray[np.uint8], homography: NDArray[np.float64], side: i
     return np.einsum("ih,hwc,jw->ijc", down, image.astype(np.float64), across, optimize=True)
 
 
-@pytest.mark.parametrize("dim", [9, 16, 31, 64])
+@pytest.mark.parametrize("dim", [9, 64])
 @pytest.mark.parametrize("fov_deg", [17.3, 30.0])
 def test_crops_agree_with_the_slow_reference(dim: int, fov_deg: float) -> None:
     photo = _photo()
@@ -73,7 +73,7 @@ def test_labels_come_from_the_pixel_at_the_center() -> None:
     np.testing.assert_array_equal(crops.render(depth, "nearest"), rendered.astype(np.uint16) * 300)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     focal=st.tuples(st.floats(60, 900), st.floats(60, 900)),
     size=st.tuples(st.integers(64, 800), st.integers(64, 800)),

@@ -291,3 +291,56 @@ def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
     shown = factor * scale
     corner = report.pixels()[20, 20]
     close(corner, color(20.5 / PHOTO[1] / shown, 20.5 / PHOTO[0] / shown))
+
+
+def objects_page(folder: Path) -> Path:
+    """A panorama with a disc of 20° at longitude 30°, and a photo without objects."""
+    directions = equirect_directions((HEIGHT, WIDTH))
+    numbers = np.zeros((HEIGHT, WIDTH), np.int32)
+    numbers[directions @ [np.cos(np.pi / 6), np.sin(np.pi / 6), 0] > np.cos(np.pi / 9)] = 7
+    row = {"number": 7, "class": "<b>lamp</b>", "score": 0.81, "longitude_deg": 30.0}
+    rgb, labels = np.full((HEIGHT, WIDTH, 3), 99, np.uint8), np.ones((HEIGHT, WIDTH), np.uint8)
+    maps: dict[str, Any] = {"prediction": labels, "numbers": numbers}
+    maps["objects"] = {7: row | {"distance_m": None}}
+    path = folder / "report.html"
+    images = [encode_image("hall", rgb, len(NAMES), **maps), photo()]
+    write_report(path, "Objects", images=images, class_names=NAMES)
+    return path
+
+
+@pytest.mark.parametrize("touch", [False, True])
+def test_a_click_or_tap_shows_the_row_of_the_object(
+    browser: Browser, tmp_path: Path, *, touch: bool
+) -> None:
+    with opened(browser, objects_page(tmp_path), touch=touch) as report:
+        left, top, width, height = report.box()
+        shown = "number 7 class <b>lamp</b> score 0.81 longitude_deg 30 distance_m unknown"
+
+        def at(longitude_deg: float) -> tuple[float, float]:
+            across = math.tan(math.radians(longitude_deg)) / math.tan(math.radians(START_DEG / 2))
+            return left + width / 2 + across * max(width, height) / 2, top + height / 2
+
+        def pointed(longitude_deg: float) -> str:
+            press = report.page.touchscreen.tap if touch else report.page.mouse.click
+            press(*at(longitude_deg))
+            report.drawn()
+            return " ".join(report.text(".object").split())
+
+        assert pointed(-30) == ""
+        assert pointed(11) == shown
+        assert "prediction: <b>lamp</b> 7" in report.text(".readout")
+        assert pointed(-30) == ""  # far away: two taps at a place would zoom
+        if not touch:
+            assert pointed(9) == ""
+            report.page.mouse.move(*at(30))
+            report.page.mouse.down()
+            report.page.mouse.move(*at(20), steps=3)
+            report.page.mouse.up()
+            assert report.text(".object") == ""  # a drag
+        report.press("0", "Enter")
+        assert report.text(".object") == ""
+        report.press(*["ArrowRight"] * 4, "Enter")
+        assert " ".join(report.text(".object").split()) == shown
+        report.choose(1)
+        assert report.text(".object") == ""
+        assert pointed(0) == ""
