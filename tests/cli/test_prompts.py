@@ -48,7 +48,7 @@ def test_sam_through_all_commands(
     (expected,) = predict(checkpoint="ours.ckpt", write=OBJECTS).values()
     names = {segment["class"] for segment in expected["segments"]}
     assert names == {"seat", "tah"}
-    assert "seat 1, score" in (tmp_path / "out" / "report.html").read_text()
+    assert '"1":{"number":1,"class":"' in (tmp_path / "out" / "report.html").read_text()
     changed = {"checkpoint": "other.ckpt", "output": "changed", "write": OBJECTS}
     (entry,) = predict(prompts=PROMPTS, **changed).values()
     assert entry == expected
