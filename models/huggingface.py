@@ -175,7 +175,6 @@ class HuggingFaceNetwork(_TransformersNetwork):
 
     Attributes:
         network: The network of transformers.
-        is_universal: True if the network returns masks with classes.
 
     Raises:
         SettingError: transformers lacks the network or is missing.
@@ -190,7 +189,6 @@ class HuggingFaceNetwork(_TransformersNetwork):
         things: Sequence[int] = (),
     ) -> None:
         super().__init__(config, SEGMENTATION, bgr, num_labels=num_classes)
-        self.is_universal = config["model_type"] not in network_types(SEGMENTATION[0])
         self._stuff = set(range(num_classes)) - set(things) if things else None
         tokens = None if task is None else torch.tensor([list(task)])
         self._task: Tensor | None

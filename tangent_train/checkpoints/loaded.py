@@ -145,6 +145,11 @@ class NetworkDescription:
         """Number of input channels."""
         return len(channel_names(self.inputs)) if self.inputs else self.normalization.channels
 
+    @property
+    def data_settings(self) -> dict[str, Any]:
+        """Inputs and normalization, as settings of a data set."""
+        return {name: self.plain()[name] for name in ("inputs", "normalization")}
+
     def trainable_settings(self) -> dict[str, Any] | None:
         """Return `settings` with null for those that depend on the data, and pretrained weights."""
         return _without_data_settings(without_weights(self.settings))

@@ -127,9 +127,7 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
         section = {**section, "level": level}
     data = settings.data if settings.input is None else {"_target_": "panoramas"}
     if loaded.inputs:
-        mean, std = list(loaded.normalization.mean), list(loaded.normalization.std)
-        normalization = {"mean": mean, "std": std}
-        data = {**data, "inputs": list(loaded.inputs), "normalization": normalization}
+        data = {**data, **loaded.data_settings}
     network = loaded.settings
     return {"level": level, "representation": section, "data": data, "network": network}
 

@@ -117,9 +117,7 @@ def _take_settings(config: Any, loaded: LoadedNetwork) -> None:
         views = panorama_settings(loaded, config.level if "level" in typed else None)
         rows = config.representation.get("erp_height")
         config.representation = views | ({} if rows is None else {"erp_height": rows})
-    mean, std = map(list, (loaded.normalization.mean, loaded.normalization.std))
-    of_network = {"inputs": list(loaded.inputs), "normalization": {"mean": mean, "std": std}}
-    config.data = {**config.data, **of_network}
+    config.data = {**config.data, **loaded.data_settings}
     if "task.eval_view_batch_size" not in typed:  # photo networks have many classes, large images
         config.task.eval_view_batch_size = views_per_forward(loaded.image_size)
 

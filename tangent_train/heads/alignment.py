@@ -32,6 +32,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, ray_lengths, xyz_to_lonlat
@@ -261,38 +262,23 @@ def sample_views(
     u, v, w = np.moveaxis(geometry.matrices @ rays, 1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         positions = (2 * np.stack([u, v], axis=-1) / w[..., None] + 1) / (width, height) - 1
-    view, point = np.nonzero((np.abs(positions).max(axis=-1) <= 1) & (w > 0))
-    position = positions[view, point]
-    index, weights = _bilinear(view, position, (len(placed), height, width))
-    taps = placed.flatten().index_select(0, on_device(index.ravel(), placed.device))
-    value = (taps.cpu().double().numpy().reshape(-1, 4) * weights).sum(axis=1)
-    of_images = views.ray_lengths()
-    index, weights = _bilinear(view, position, of_images.shape)
-    lengths = (of_images.ravel()[index] * weights).sum(axis=1)
+    is_shown = (np.abs(positions).max(axis=-1) <= 1) & (w > 0)
+    view, point = np.nonzero(is_shown)
+    position = positions[is_shown]
+    positions[~is_shown] = 0
+    value = _bilinear(placed, positions)[is_shown]
+    lengths = _bilinear(torch.from_numpy(views.ray_lengths()[:, None]), positions)[is_shown]
     value = np.where(np.isfinite(value), value, np.nan)
     position = position if images is views else np.full_like(position, np.nan)
     return ViewSamples(len(placed), view, point, value, lengths, position)
 
 
-def _bilinear(view: Indices, position: Floats, shape: tuple[int, ...]) -> tuple[Indices, Floats]:
-    """Return flat indices and weights ``(m, 4)`` of the pixels around positions in images.
-
-    Args:
-        view: ``(m,)`` numbers of the images; one image is that of all.
-        position: ``(m, 2)`` see `ViewSamples`.
-        shape: ``(n, h, w)`` of the images.
-    """
-    count, *sides = shape
-    first, share = [], []
-    for side, at in zip(sides, position.T[::-1], strict=True):
-        place = (((at + 1) * side - 1) / 2).clip(0, side - 1)
-        first.append(np.minimum(place, max(0, side - 2)).astype(np.int64))
-        share.append(np.stack([1 - (place - first[-1]), place - first[-1]], axis=-1))
-    corner = (view * (count > 1) * sides[0] + first[0]) * sides[1] + first[1]
-    down, across = (min(1, side - 1) for side in sides)
-    steps = np.array([0, across, down * sides[1], down * sides[1] + across])
-    weights = share[0][:, :, None] * share[1][:, None]
-    return corner[:, None] + steps, weights.reshape(-1, 4)
+def _bilinear(images: Tensor, positions: Floats) -> Floats:
+    """Return values ``(n, P)`` of images ``(1 or n, 1, h, w)`` at positions ``(n, P, 2)``."""
+    at = torch.from_numpy(positions[:, None].astype(np.float32)).to(images)
+    images = images.expand(len(positions), -1, -1, -1)
+    values = grid_sample(images, at, padding_mode="border", align_corners=False)
+    return np.asarray(values.cpu().numpy()[:, 0, 0], np.float64)
 
 
 class Alignment(NamedTuple):

@@ -219,8 +219,7 @@ class ClassesHead(Head):
         """Return 1 − mIoU of one image, and the mIoU; 0 and "" without labeled pixels."""
         if not truth.any():
             return 0.0, ""
-        count = len(self.class_names)
-        counts = segmentation.count_image(prediction.cpu(), truth.cpu(), count).pixels
+        counts = segmentation.confusion(prediction.cpu(), truth.cpu(), len(self.class_names))
         miou = float(segmentation.segmentation_scores(counts).means["miou"])
         return 1 - miou, f"mIoU {100 * miou:.1f}\u00a0%"
 

@@ -42,11 +42,8 @@ _ROWS = 512
 _LEAST_SHARE = 0.5
 """Part of its masks that an object must win, else it is left out."""
 
-_NOTHING = 1e-12
-
 _LEAST_SR = 1e-5
 """Solid angle of the smallest object, in steradians: a disc of 0.2°."""
-
 
 _BOX = "longitude_deg", "latitude_deg", "width_deg", "height_deg"
 OBJECT_COLUMNS = ("number", "class", "score", *_BOX, "solid_angle_sr", "distance_m")
@@ -77,6 +74,7 @@ def join_objects(
     shape: tuple[int, int],
     camera_matrix: Floats | None = None,
     valid: NDArray[np.bool_] | None = None,
+    is_thing: NDArray[np.bool_] | None = None,
     least_overlap: float = 0.3,
 ) -> Objects:
     """Put together the objects of a panorama or photo.
@@ -86,6 +84,8 @@ def join_objects(
         shape: ``(H, W)`` of the panorama or photo.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for a panorama.
         valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
+        is_thing: ``(K,)`` True for classes that have objects, to leave out those of others and of
+            the class −1; None to take all.
         least_overlap: Intersection over union, at the directions that two views see, from which
             masks join; measured in docs/explanation/objects.md.
 
@@ -100,32 +100,35 @@ def join_objects(
     )
     numbers = np.stack([of_view.numbers.cpu().numpy() for of_view in segments])
     numbers = np.where(numbers > 0, numbers + first[:-1, None, None], 0)
+    view = np.repeat(np.arange(len(segments)), np.diff(first))
+    if is_thing is not None:
+        chosen = np.append(is_thing, False)[classes]
+        numbers = np.append(0, chosen.cumsum() * chosen)[numbers]
+        classes, scores, view = classes[chosen], scores[chosen], view[chosen]
     rows = min(shape[0], _ROWS)
     small = shape if camera_matrix is not None else (rows, 2 * rows)
     valid = np.ones(shape, np.bool_) if valid is None else valid
     weights = (pixel_solid_angles(small, camera_matrix) * resize(valid, small, "nearest")).ravel()
     masks, seen = _incidence(numbers, _geometry(sets, small), weights, len(classes))
-    view = np.repeat(np.arange(len(segments)), np.diff(first))
     group = _groups(masks, seen, view, classes, least_overlap)
-    area = masks.sum(axis=1)
-    total = np.bincount(group, area)
-    of_group = np.bincount(group, area * scores) / np.maximum(total, _NOTHING)
-    class_of = np.zeros(len(total), np.int64)
+    area = masks.sum(axis=1) + 1e-12  # masks may lie between the pixels of the canvas
+    of_group = np.bincount(group, area * scores) / np.bincount(group, area)
+    count = len(of_group)
+    class_of = np.zeros(count, np.int64)
     class_of[group] = classes
     winners = np.zeros(shape, np.int32)
     table = np.append(0, group + 1).astype(np.int32)[numbers]
     votes = np.append(1, of_group).astype(np.float32)
     kernels.over_rows(kernels.vote, *shape, table, _geometry(sets, shape), votes, winners)
     of_masks = np.ones(len(group)), (group, np.arange(len(group)))
-    in_groups = sparse.csr_array(of_masks, (len(total), len(group)))
+    in_groups = sparse.csr_array(of_masks, (count, len(group)))
     covered = (in_groups @ masks).astype(bool) @ weights
     winners *= valid
-    won: Any = np.bincount(
-        winners.ravel(), pixel_solid_angles(shape, camera_matrix).ravel(), len(total) + 1
-    )[1:]
+    angles = pixel_solid_angles(shape, camera_matrix)
+    won: Any = np.bincount(winners.ravel(), angles.ravel(), count + 1)[1:]
     kept = np.flatnonzero((won >= _LEAST_SR) & (won >= _LEAST_SHARE * covered))
     kept = kept[np.argsort(-won[kept], kind="stable")]
-    table = np.zeros(len(won) + 1, np.int32)
+    table = np.zeros(count + 1, np.int32)
     table[kept + 1] = np.arange(1, len(kept) + 1)
     return Objects(table[winners], class_of[kept], of_group[kept], won[kept])
 

@@ -27,8 +27,6 @@ from tangent_train.metrics.panoptic import LABEL, quality
 from tangent_train.metrics.scores import ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.rendering.representations.views import Views
 
-_BYTE = 256
-
 
 class PanopticHead(ClassesHead):
     """Classes for every pixel, and objects of some of them, see `heads.objects`.
@@ -126,30 +124,26 @@ class PanopticHead(ClassesHead):
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write a panoptic map in COCO's colors, labels, 16-bit numbers of objects and pictures."""
-        codes = predicted.pixels
         if file := files.get("labels"):
-            write_pixels(file, (codes // LABEL).astype(np.uint8))
+            write_pixels(file, self.labels_in(predicted.pixels))
         if file := files.get("objects"):
-            write_pixels(file, (codes % LABEL).astype(np.uint16))
-        shown = {kind: file for kind, file in files.items() if kind in (self.source, *PICTURES)}
-        super().write(shown, predicted)
+            write_pixels(file, (predicted.pixels % LABEL).astype(np.uint16))
+        super().write(files, predicted)
 
     def write_source(self, file: Path, pixels: NDArray[Any]) -> None:
         """Write a panoptic map as RGB: ``R + 256 G + 65536 B``; 0 where a thing has no object."""
-        codes = self._known(pixels).astype(np.uint32)
-        write_pixels(
-            file, np.stack([codes >> shift & 255 for shift in (0, 8, 16)], -1).astype("u1")
-        )
+        codes = self._known(pixels).astype("<u4")
+        write_pixels(file, codes[..., None].view(np.uint8)[..., :3])
 
     def read(self, file: Path) -> NDArray[np.int32]:
         """Read a panoptic map."""
         colors: Any = read_rgb(file, as_stored=True)
-        codes: NDArray[np.int32] = colors @ np.array([1, _BYTE, LABEL], np.int32)
+        codes: NDArray[np.int32] = colors @ np.array([1, 256, LABEL], np.int32)
         return codes
 
     def labels_in(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the labels of a panoptic map."""
-        return pixels // LABEL
+        return (pixels // LABEL).astype(np.uint8)
 
     def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
         """Return labels, numbers of objects, and rows of the table, which evaluations lack."""
@@ -178,7 +172,7 @@ class PanopticHead(ClassesHead):
                 box = [columns.start, rows.start, *size]
                 segment = {"id": code, "category_id": label, "area": count, "bbox": box}
                 segments.append(segment | {"iscrowd": 0} | of_number.get(number, {}))
-        of_classes = predicted._replace(pixels=codes // LABEL)
+        of_classes = predicted._replace(pixels=self.labels_in(codes))
         return super().entry(of_classes, is_counted) | {"segments": segments}
 
     def write_tables(self, folder: Path, entries: Sequence[Mapping[str, Any]]) -> None:
@@ -216,8 +210,7 @@ class PanopticMosaic(LabelMosaic):
         self, head: PanopticHead, *given: Any, camera_matrix: Any = None, **named: Any
     ) -> None:
         super().__init__(head, *given, **named)
-        # With that of the class −1 at the end.
-        self._camera_matrix, self._things = camera_matrix, np.append(head.is_thing[1:], False)
+        self._camera_matrix, self._is_thing = camera_matrix, head.is_thing[1:]
         self._sets: list[tuple[Views, Sequence[Segments]]] = []
         self._objects: Objects | None = None
 
@@ -228,20 +221,13 @@ class PanopticMosaic(LabelMosaic):
 
     def add_segments(self, segments: Sequence[Segments], views: Views) -> None:
         """Add the objects of some views."""
-        self._sets.append((views, list(map(self._chosen, segments))))
-
-    def _chosen(self, segments: Segments) -> Segments:
-        """Return the objects of the classes that have objects."""
-        things = torch.from_numpy(self._things).to(segments.classes.device)
-        is_chosen = things[segments.classes]
-        table = torch.cat([is_chosen.new_zeros(1), is_chosen.cumsum(0) * is_chosen]).int()
-        numbers = table.index_select(0, segments.numbers.flatten()).view_as(segments.numbers)
-        return Segments(numbers, segments.classes[is_chosen], segments.scores[is_chosen])
+        self._sets.append((views, segments))
 
     def pixels(self) -> Tensor:
         """Return a panoptic map ``(H, W)``, int32."""
         labels = super().pixels().int()
-        found = join_objects(self._sets, self.shape, self._camera_matrix, self.valid)
+        given = self._camera_matrix, self.valid, self._is_thing
+        found = join_objects(self._sets, self.shape, *given)
         self._objects = found
         numbers = torch.from_numpy(found.numbers).to(labels.device)
         of_objects = torch.from_numpy(np.append(0, found.classes + 1)).to(labels)

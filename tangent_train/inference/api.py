@@ -60,7 +60,6 @@ from tangent_train.io.gpano import Eye, Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind, Upright
-from tangent_train.metrics.panoptic import LABEL
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
 from tangent_train.rendering.forward import check_grid, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic, blend_back
@@ -255,9 +254,8 @@ class Network:
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
         given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye, prompts)
-        found = self._predictor.predict(given).pixels().cpu().numpy()
-        if self.loaded.things:
-            found = (found // LABEL).astype(np.uint8)
+        head: Any = self._predictor.head
+        found = head.labels_in(self._predictor.predict(given).pixels().cpu().numpy())
         return _as_given(_masked(found, given, image, mask, 0), image)
 
     def panoptic(

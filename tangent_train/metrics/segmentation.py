@@ -111,7 +111,7 @@ def count_image(
     for labels in (prediction, truth):
         _check(labels, k)
     if truth.ndim != 2:
-        pixels = _confusion(prediction, truth, k)
+        pixels = confusion(prediction, truth, k)
         bands = pixels.new_zeros((len(BAND_EDGES_DEG) - 1, k, k))
         steradians = torch.zeros_like(pixels, dtype=torch.float64)
         regions = steradians.new_zeros((0, len(REGIONS) + 1, 3, k - 1))
@@ -158,7 +158,7 @@ def _count_panorama(prediction: Tensor, truth: Tensor, k: int) -> tuple[Tensor, 
     return bands, by_angle, torch.from_numpy(of_edges), torch.from_numpy(seam)[None]
 
 
-def _confusion(prediction: Tensor, truth: Tensor, k: int) -> Tensor:
+def confusion(prediction: Tensor, truth: Tensor, k: int) -> Tensor:
     """Count the pixels of known classes."""
     pairs = torch.add(prediction.int(), truth.int(), alpha=k).flatten()
     counts = torch.bincount(pairs, minlength=k * k).reshape(k, k)

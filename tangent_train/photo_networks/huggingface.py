@@ -238,7 +238,7 @@ def _predicts_depth(config: Mapping[str, Any], path: Path, depth: DepthKind | No
 def _processor(folder: Path, model_type: str) -> dict[str, Any]:
     """Return settings of the image processor, with the defaults of its class.
 
-    ``do_flip_channel_order`` and ``normalization`` (of images from 0 to 1) are measured. Settings
+    ``do_flip_channel_order`` and ``normalization`` (for images from 0 to 1) are measured. Settings
     with a text are left out, because some of them are names of files that would be fetched.
 
     Raises:
@@ -271,7 +271,8 @@ def _processor(folder: Path, model_type: str) -> dict[str, Any]:
     numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
     rounded = {n: [float(f"{value:.6g}") for value in values] for n, values in numbers.items()}
     settings: dict[str, Any] = processor.to_dict()
-    return settings | {"normalization": rounded, "do_flip_channel_order": bool(order[0])}
+    measured = {"normalization": Normalization(**rounded), "do_flip_channel_order": bool(order[0])}
+    return settings | measured
 
 
 def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]] | None:
@@ -353,8 +354,7 @@ def _load_tensors(network: Any, tensors: dict[str, Tensor], folder: Path) -> Non
         raise DataError(
             folder,
             found=f"other weights: {', '.join(wrong[:_LISTED])}",
-            expected=f"weights of {type(inner).__name__} as described in config.json"
-            + ", for the classes in its id2label" * hasattr(network, "is_universal"),
+            expected=f"weights of {type(inner).__name__} as described in config.json",
         )
     inner.load_state_dict(loaded.state_dict())
 

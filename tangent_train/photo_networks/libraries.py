@@ -91,12 +91,11 @@ def load_torchvision(
     network = build_from_config(settings, "network")
     tensors = tensors_for(network, Path(weights)) if is_file else fetch_tensors(str(chosen))
     _load_used(network, tensors, weights)
-    default = {"mean": preset.mean, "std": preset.std}
     return PhotoNetwork(
         module=network,
         settings=settings,
         score_names=names,
-        normalization=Normalization.of(normalization or default, 3),
+        normalization=Normalization.of(normalization or Normalization(preset.mean, preset.std), 3),
         image_size=(preset.resize_size[0], preset.resize_size[0]),
         score_kind="logits",
     )

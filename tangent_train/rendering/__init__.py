@@ -4,9 +4,9 @@ NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on 
 by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from tangent_train.imports import on_first_use
 from tangent_train.rendering.forward import Blend, equirect_to_tangent, perspective, rotate_equirect
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 from tangent_train.rendering.representations.pinhole import (
@@ -16,7 +16,6 @@ from tangent_train.rendering.representations.pinhole import (
 )
 from tangent_train.rendering.representations.views import Representation
 from tangent_train.rendering.resampling import Interpolation
-from tangent_train.rendering.tables import set_table_cache_limit
 
 if TYPE_CHECKING:
     from tangent_train.rendering.mosaic import tangent_to_equirect, tangent_to_labels
@@ -36,7 +35,6 @@ __all__ = [
     "equirect_to_tangent",
     "perspective",
     "rotate_equirect",
-    "set_table_cache_limit",
     "tangent_to_equirect",
     "tangent_to_labels",
 ]
@@ -47,10 +45,6 @@ _WITH_TORCH = {
     "tangent_to_equirect": "mosaic",
     "tangent_to_labels": "mosaic",
 }
-"""Modules that import torch, which takes seconds, when one of their names is used."""
+"""Modules that import torch, which takes seconds."""
 
-
-def __getattr__(name: str) -> Any:
-    if name in _WITH_TORCH:
-        return getattr(import_module(f"{__name__}.{_WITH_TORCH[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = on_first_use(__name__, _WITH_TORCH)

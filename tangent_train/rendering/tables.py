@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid, equirect_latitudes, equirect_longitudes
 from tangent_train.rendering import kernels
 from tangent_train.rendering.kernels import Array, njit_exact, over_rows
@@ -63,20 +62,11 @@ class TableCache:
         with self._lock:
             size = _nbytes(table)
             if size <= self.limit and key not in self._tables:
-                self._drop(self.limit - size)
                 self._tables[key] = table
                 self.nbytes += size
+                while self.nbytes > self.limit:
+                    self.nbytes -= _nbytes(self._tables.popitem(last=False)[1])
         return table
-
-    def set_limit(self, limit: int) -> None:
-        """Change the limit and drop tables that no longer fit."""
-        with self._lock:
-            self.limit = limit
-            self._drop(limit)
-
-    def _drop(self, limit: int) -> None:
-        while self.nbytes > limit:
-            self.nbytes -= _nbytes(self._tables.popitem(last=False)[1])
 
     def _new_lock(self) -> None:
         """Replace the lock in a forked process: it may have been locked by another thread."""
@@ -88,31 +78,14 @@ def _nbytes(table: tuple[Any, ...]) -> int:
 
 
 TABLES = TableCache(limit=2**30)
-_ROTATED_SHARE = 16
-_ROTATED = TableCache(limit=TABLES.limit // _ROTATED_SHARE)
+"""At level 10 and base level 1 the tables take 168 MB from panorama to images."""
+
+_ROTATED = TableCache(limit=2**26)
 """Tables of rotated grids, reused for depth and labels after RGB. They have a separate cache,
 because random rotations would evict all other tables."""
 
 _DEVICE_SHARE = 8
 """Tables on a GPU take at most an eighth of its memory."""
-
-
-def set_table_cache_limit(nbytes: int) -> None:
-    """Limit the memory of the rendering tables of this process; the default is 1 GiB.
-
-    At level 10 and base level 1 the tables take 168 MB from panorama to images. Tables of rotated
-    grids may use another sixteenth, and tables on a GPU an eighth of its memory.
-
-    Args:
-        nbytes: Maximum number of bytes in the cache; 0 disables it.
-
-    Raises:
-        SettingError: The number is negative.
-    """
-    if nbytes < 0:
-        raise SettingError("table cache limit", found=nbytes, expected="0 bytes or more")
-    TABLES.set_limit(nbytes)
-    _ROTATED.set_limit(nbytes // _ROTATED_SHARE)
 
 
 @lru_cache

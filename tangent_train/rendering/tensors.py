@@ -140,7 +140,7 @@ def _in_frame(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
 
 def _sampled(image: Tensor, positions: Tensor) -> Tensor:
     """Return bilinear values ``(n, C, h, w)`` of a panorama at positions ``(n, h, w, 2)``."""
-    framed = _framed(exact(image))[None]
+    framed = with_frame(exact(image))[None]
     count, given = len(positions), positions.to(framed.dtype)
     if framed.requires_grad:  # the gradient of an expanded tensor takes n times its memory
         given = given.flatten(0, 1)[None]
@@ -153,15 +153,15 @@ def _sampled(image: Tensor, positions: Tensor) -> Tensor:
     return values.to(image.dtype)
 
 
-def _framed(image: Tensor) -> Tensor:
-    """Return a panorama ``(C, H, W)`` with its frame, ``(C, H + 2, W + 2)``."""
-    above, below = (_half_revolution(image[:, row]) for row in (slice(1), slice(-1, None)))
-    tall = torch.cat([above, image, below], dim=1)
-    return torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=2)
+def with_frame(image: Tensor) -> Tensor:
+    """Return a panorama ``(..., H, W)`` with its frame, ``(..., H + 2, W + 2)``."""
+    above, below = _half_revolution(image[..., :1, :]), _half_revolution(image[..., -1:, :])
+    tall = torch.cat([above, image, below], dim=-2)
+    return torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=-1)
 
 
 def _half_revolution(row: Tensor) -> Tensor:
-    """Return a row ``(C, 1, W)`` rotated by 180°; means of two columns if W is odd."""
+    """Return a row ``(..., 1, W)`` rotated by 180°; means of two columns if W is odd."""
     width = row.shape[-1]
     rotated = row.roll(width // 2, -1)
     return (rotated + row.roll(width // 2 + 1, -1)) / 2 if width % 2 else rotated

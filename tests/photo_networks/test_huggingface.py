@@ -181,7 +181,7 @@ def test_an_image_processor_is_the_librarys_whatever_its_file_leaves_out(
             continue
         expected = np.moveaxis(pixels.reshape(-1, *pixels.shape[-3:])[0], 0, -1)[16, 16]
         found = huggingface._processor(tmp_path, "segformer")
-        normalized = (color / 255 - found["normalization"]["mean"]) / found["normalization"]["std"]
+        normalized = (color / 255 - found["normalization"].mean) / found["normalization"].std
         normalized = normalized[::-1] if found["do_flip_channel_order"] else normalized
         np.testing.assert_allclose(normalized, expected, rtol=1e-4, atol=1e-4, err_msg=f"{change}")
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -19,6 +18,7 @@ from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
 from tangent_train.rendering.representations.views import RotationAugmentation, Views
 from tangent_train.rendering.resampling import Interpolation, Pixels, resize
+from tangent_train.rendering.tensors import with_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +69,9 @@ class EquirectViews(Views):
         if self.rotation is not None:
             scores = rotate_equirect(scores, self.rotation)
         rows, columns = scores.shape[-2:]
-        beyond = (scores[..., i : i + 1 or None, :].roll(columns // 2, -1) for i in (0, -1))
-        above, below = beyond
-        tall = torch.cat([above, scores, below], dim=-2)
-        framed = torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=-1)
         x, y = shape[1] / columns, shape[0] / rows
         box = np.array([[-x, -y, shape[1] + x, shape[0] + y]])
-        return framed, PhotoCrops(box, (rows + 2, columns + 2), is_overlapping=False)
+        return with_frame(scores), PhotoCrops(box, (rows + 2, columns + 2), is_overlapping=False)
 
 
 class EquirectRepresentation:
