@@ -187,8 +187,9 @@ class PredictSettings(PromptSettings, ImageSettings, NetworkSettings):
 
     align_across: Literal["frames"] | ExistingPath | None = None
     """depth: bring all panoramas to one scale: frames (of a video, or of a folder in order, each
-    near the next) | their poses, in whose unit depth is then (the JSON file of tangent-render
-    poses=, or a folder of a sparse COLMAP model); null = each has its own"""
+    near the next) | their poses, in whose unit depth is then (folder of a sparse COLMAP model, JSON
+    file of tangent-render poses=, CSV file, or folder of tran.txt and rot.txt); null = each has its
+    own"""
 
     # --- output ---
     output: Path
@@ -285,7 +286,7 @@ class RenderSettings(ImageSettings):
     classes.json)"""
     poses: ExistingPath | None = None
     """folder of a sparse COLMAP model, whose poses of panoramas are written as JSON; with
-    nerfstudio=true, it or the JSON file"""
+    nerfstudio=true, also the JSON file or other poses"""
 
     # --- Nerfstudio ---
     nerfstudio: bool = False

@@ -157,7 +157,8 @@ def test_objects_of_structured3d(tmp_path: Path, run: Run) -> None:
         room = (
             tmp_path / "data" / f"scene_{number:05d}" / "2D_rendering" / "7" / "panorama" / "full"
         )
-        files = {"rgb_rawlight": rgb, "semantic": labels, "instance": numbers}
+        files: dict[str, NDArray[Any]] = {"rgb_rawlight": rgb, "semantic": labels}
+        files["instance"] = numbers
         for name, pixels in files.items():
             write_pixels(room / f"{name}.png", pixels)
     (tmp_path / "map.json").write_text(json.dumps({name: name for name in NAMES}))

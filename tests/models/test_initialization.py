@@ -23,7 +23,7 @@ def _network(channels: int = 3, classes: int = 5) -> nn.Module:
 
 
 OURS = {"prefix": "network.", "beside": {"class_weights": torch.ones(5)}}
-LIGHTNING = {"prefix": "model.net.", "beside": {}}
+LIGHTNING: dict[str, Any] = {"prefix": "model.net.", "beside": {}}
 
 
 def _save(
@@ -173,7 +173,7 @@ def _kinds(names: Iterable[str]) -> set[str]:
 
 
 @pytest.mark.parametrize(("saved", "wanted"), [("", "ao"), ("ao", ""), ("a", "ao")])
-def test_networks_fit_into_eaoh_others_wrappers(saved: str, wanted: str, tmp_path: Path) -> None:
+def test_networks_fit_into_the_wrappers_of_others(saved: str, wanted: str, tmp_path: Path) -> None:
     other, network = _wrapped(saved), _wrapped(wanted)
     _save(other.state_dict(), tmp_path / "other.ckpt", **LIGHTNING)
     origins = initialize(network, tmp_path / "other.ckpt")
