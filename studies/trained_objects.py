@@ -31,7 +31,7 @@ from models.segments import Segments, front_segments
 from studies.output import FOLDER, Row, save
 from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
-from tangent_train.heads.objects import LEAST_OVERLAP, join_objects
+from tangent_train.heads.objects import join_objects
 from tangent_train.inference.views import view_settings
 from tangent_train.metrics.panoptic import LABEL
 from tangent_train.photo_networks import PhotoNetwork, import_network
@@ -50,11 +50,14 @@ ROOMS: dict[Area, int] = {"1": 24, "2": 24, "3": 24, "4": 24, "5a": 10, "5b": 10
 
 DATA, FILE = Path("data/rooms_objects"), FOLDER / "objects" / "centers.ckpt"
 VARIANTS = {
-    "joined": (LEAST_OVERLAP, False),
+    "joined": (0.3, False),
     "not joined": (1.1, False),
-    "joined connected parts": (LEAST_OVERLAP, True),
+    "joined connected parts": (0.3, True),
 }
-"""Smallest overlap of masks that join (nothing reaches 1.1); True for parts without centers."""
+"""Smallest overlap of masks that join; True for parts without centers.
+
+0.3 is the default, and nothing reaches 1.1.
+"""
 
 _LEAST_PIXELS = 30
 _SIGMA = 3.0
