@@ -107,7 +107,8 @@ class _Prediction:
     """
 
     def __init__(self, settings: PredictSettings) -> None:
-        original = loaded = load_network(settings.checkpoint, settings.trust)
+        original = load_network(settings.checkpoint, settings.trust)
+        original = loaded = original.prompted(settings.prompts, settings.threshold)
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
@@ -245,7 +246,7 @@ class _Prediction:
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     """Return the names of the settings that are read besides those of the head."""
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
-    names |= {"levels", "base_level", "blend", "write", "report", "shard"}
+    names |= {"levels", "base_level", "blend", "write", "report", "shard", "prompts", "threshold"}
     names |= {"view_batch_size", "compile", "device", "trust"}
     panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
     if loaded.predicts == DISTANCE:
