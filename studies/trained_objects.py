@@ -7,6 +7,7 @@ the objects of held-out rooms with and without joining.
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -203,6 +204,7 @@ def evaluate(title: str) -> Row:
     """Return scores of things in the test rooms by pixels, in percent; the title is a variant."""
     overlap, is_parts = VARIANTS[title]
     folder = FILE.with_name(title)
+    shutil.rmtree(folder, ignore_errors=True)
     rooms = [f"data.rooms.rooms.area_{area}={number}" for area, number in ROOMS.items()]
     arguments = [
         *("tangent-evaluate", "task=panoptic", f"checkpoint={FILE}", f"hydra.run.dir={folder}"),
