@@ -60,7 +60,8 @@ def test_cameras_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_missing_package_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "depth_anything_3", None)
+    for name in ("depth_anything_3", "depth_anything_3.cfg"):  # it may be imported already
+        monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(SettingError, match="pip install --no-deps depth-anything-3 addict einops"):
         DepthAnything3()
     with pytest.raises(SettingError, match="preset: found 'da3metric-large'; expected 'da3-small'"):
