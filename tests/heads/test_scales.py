@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from studies.depth_frames import errors
 from tangent_train.geometry import (
     PanoramaPose,
     equirect_directions,
@@ -120,3 +121,12 @@ def test_without_parallax_nothing_determines_the_unit(step_m: float) -> None:
     poses, distances = _walk(3, turned=False, step_m=step_m)
     found, _ = pose_scales(distances * _smooth_errors(3, 0.1), poses)
     assert np.isnan(found).all()
+
+
+@pytest.mark.parametrize(("step_m", "most"), [(0.1, 0.06), (0.2, 0.09)])
+def test_frames_of_walks_through_synthetic_rooms(step_m: float, most: float) -> None:
+    """Walks of 2 m past furniture, whose distances are ray-cast."""
+    for seed in range(3):
+        largest, of_neighbors = errors(np.random.default_rng(seed), step_m, 0)
+        assert largest < most
+        assert of_neighbors < 0.01
