@@ -150,11 +150,7 @@ def load(
 
 
 def prompted(
-    folder: Path,
-    config: Any,
-    prompts: Mapping[str, Sequence[str]],
-    threshold: float | None,
-    normalization: Any,
+    folder: Path, config: Any, prompts: Mapping[str, Any], threshold: Any, normalization: Any
 ) -> PhotoNetwork:
     """Load a network that finds what a text names, with the texts as classes.
 
@@ -166,7 +162,6 @@ def prompted(
         normalization: See `load`.
     """
     config = config.get("detector_config") or config  # SAM 3 is published with its tracker
-    names = tuple(prompts)
     with offline():
         described = architecture(config)
         check_choice("model, with prompts=", described["model_type"], tuple(TEXT_CLASSES))
@@ -175,11 +170,8 @@ def prompted(
         padding = {"pad_id": tokenizer.pad_token_id, "pad_token": tokenizer.pad_token}
         tokenizer.backend_tokenizer.enable_padding(**padding)
         encoded = tokenizer.backend_tokenizer.to_str().encode()
-        settings = {
-            "_target_": "models.PromptedNetwork",
-            "config": described,
-            "tokenizer_bytes": len(encoded),
-        }
+        settings: dict[str, Any] = {"_target_": "models.PromptedNetwork", "config": described}
+        settings["tokenizer_bytes"] = len(encoded)
         network: Any = build_from_file(settings, "network", folder / "config.json").eval()
         _load_tensors(network, tensors_in(folder), folder)
         network.tokenizer = torch.frombuffer(bytearray(encoded), dtype=torch.uint8)
@@ -187,11 +179,11 @@ def prompted(
     return PhotoNetwork(
         module=network,
         settings=settings,
-        score_names=(*names, UNKNOWN_NAME),
+        score_names=(*prompts, UNKNOWN_NAME),
         normalization=Normalization.of(normalization or processor["normalization"], 3),
         image_size=network.fixed_size,
         score_kind="logits",
-        things=names if described["model_type"] == "sam3" else (),
+        things=tuple(prompts) if described["model_type"] == "sam3" else (),
         unknown=(UNKNOWN_NAME,),
     )
 

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -102,16 +102,11 @@ def load_torchvision(
 
 
 def _mask_rcnn(
-    model: str,
-    chosen: WeightsEnum,
-    file: Path | None,
-    names: Sequence[str],
-    normalization: Any,
-    threshold: float,
+    model: str, chosen: WeightsEnum, file: Path | None, names: Any, colors: Any, threshold: float
 ) -> PhotoNetwork:
     """Load Mask R-CNN, which normalizes images itself; `file` None loads the published weights."""
     labels = [k for k, name in enumerate(names) if k and name != _NO_CLASS]
-    colors = Normalization.of(normalization or "imagenet", 3)
+    colors = Normalization.of(colors or "imagenet", 3)
     settings = {
         "_target_": "models.MaskRCNN",
         "model": model,
