@@ -59,7 +59,7 @@ class Looking(_Plain):
 class Sure(_Plain):
     """Depth with a confidence."""
 
-    def forward(self, images: Tensor) -> dict[str, Tensor]:
+    def forward(self, images: Tensor) -> Any:
         depth, confidence, *_ = super().forward(images).exp().unbind(dim=1)
         return {"out": depth, "confidence": confidence}
 
