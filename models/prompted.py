@@ -1,4 +1,4 @@
-"""Networks of transformers that find what a text names, with fixed texts."""
+"""Networks of transformers that find what a text names."""
 
 from __future__ import annotations
 
@@ -14,61 +14,85 @@ from torch.nn import functional
 
 from models.huggingface import architecture, image_processor_class
 from models.segments import Segments, front_segments
-from tangent_train.errors import check_choice
 
 TEXT_CLASSES = {"clipseg": "CLIPSegForImageSegmentation", "sam3": "Sam3Model"}
 """Class of transformers of each kind of network that takes text."""
 
-_TEXT_TOWER = {
-    "clipseg": ("clip.text_model", "clip.text_projection"),
-    "sam3": ("text_encoder", "text_projection"),
-}
-"""Parts that only embed text."""
-
 
 class PromptedNetwork(nn.Module):
-    """CLIPSeg (Lüddecke and Ecker, CVPR 2022) or SAM 3 (Meta, 2025) with the embeddings of prompts.
+    """CLIPSeg (Lüddecke and Ecker, CVPR 2022) or SAM 3 (Meta, 2025) with texts as classes.
 
     The score of a class is the largest logit of its prompts' masks; the last score is the logit of
-    the threshold: "none of the classes". SAM 3 also returns objects.
+    the threshold: "none of the classes". SAM 3 also returns objects. Prompts are embedded by
+    `set_prompts`, not in `forward`.
 
     Args:
         config: `architecture` of the network, with ``model_type``.
+        tokenizer_bytes: Size of the tokenizer's description.
         class_of_prompt: ``(P,)`` index of the class of each prompt.
-        num_tokens: Number of tokens of an embedding; 0 for a single vector (CLIPSeg).
         threshold: Probability that a class must exceed.
 
     Attributes:
-        network: The network of transformers, without its text tower.
-        embeddings: ``(P, D)``, or ``(P, num_tokens, D)``.
-        is_token: ``(P, num_tokens)`` False for padding.
-
-    Raises:
-        SettingError: The network takes no text.
+        network: The network of transformers.
+        tokenizer: Description of the tokenizer (``tokenizer.json``), as UTF-8, with its padding.
+        embeddings: ``(P, D)``, or for SAM 3 ``(P, N, D)`` of N tokens.
+        is_token: ``(P, N)`` False for padding.
     """
 
+    tokenizer: Tensor
     embeddings: Tensor
     is_token: Tensor
 
     def __init__(
         self,
         config: Mapping[str, Any],
-        class_of_prompt: Sequence[int],
-        num_tokens: int = 0,
+        tokenizer_bytes: int,
+        class_of_prompt: Sequence[int] = (),
         threshold: float = 0.5,
     ) -> None:
         super().__init__()
-        self.network = without_text(text_network(config))
-        made = self.network.config
+        import transformers as hf
+
+        made = hf.AutoConfig.for_model(**architecture(config))
+        self.network: Any = getattr(hf, TEXT_CLASSES[made.model_type])(made)
         self._class_of_prompt, self._threshold = list(class_of_prompt), threshold
         self._is_sam = made.model_type == "sam3"
-        size = made.detr_encoder_config.hidden_size if self._is_sam else made.projection_dim
         side = made.vision_config.image_size
         self.fixed_size = (side, side)
-        count = len(self._class_of_prompt)
-        shape = (count, num_tokens, size) if num_tokens else (count, size)
+        tokens = len(self._class_of_prompt), made.text_config.max_position_embeddings
+        size = made.detr_encoder_config.hidden_size if self._is_sam else made.projection_dim
+        shape = (*tokens, size) if self._is_sam else (tokens[0], size)
+        self.register_buffer("tokenizer", torch.zeros(tokenizer_bytes, dtype=torch.uint8))
         self.register_buffer("embeddings", torch.zeros(shape))
-        self.register_buffer("is_token", torch.ones(count, num_tokens, dtype=torch.bool))
+        self.register_buffer("is_token", torch.ones(tokens, dtype=torch.bool))
+
+    @torch.no_grad()
+    def set_prompts(
+        self, prompts: Mapping[str, Sequence[str]] | None, threshold: float | None = None
+    ) -> dict[str, Any]:
+        """Replace the prompts or the threshold; return the changed arguments of the class.
+
+        Args:
+            prompts: Texts of each class by its name; None to keep them.
+            threshold: Probability that a class must exceed; None to keep it.
+        """
+        self._threshold = threshold or self._threshold
+        if prompts is not None:
+            from tokenizers import Tokenizer
+
+            tokenizer = Tokenizer.from_str(self.tokenizer.numpy(force=True).tobytes().decode())
+            length = self.is_token.shape[1]
+            tokenizer.enable_truncation(length)
+            tokenizer.enable_padding(**{**(tokenizer.padding or {}), "length": length})
+            tokens = tokenizer.encode_batch([text for of in prompts.values() for text in of])
+            device = self.tokenizer.device
+            ids = torch.tensor([of.ids for of in tokens], device=device)
+            mask = torch.tensor([of.attention_mask for of in tokens], device=device)
+            of_text = self.network if self._is_sam else self.network.clip
+            returned = of_text.get_text_features(ids, attention_mask=mask)
+            self.embeddings, self.is_token = returned.pooler_output, mask > 0
+            self._class_of_prompt = [k for k, of in enumerate(prompts.values()) for _ in of]
+        return {"class_of_prompt": self._class_of_prompt, "threshold": self._threshold}
 
     def forward(self, images: Float[Tensor, "batch channels height width"]) -> Any:
         """Return scores ``(batch, K + 1, height, width)``; of SAM 3 a dict with segments too."""
@@ -116,30 +140,3 @@ class PromptedNetwork(nn.Module):
         masks = torch.cat([of["masks"].reshape(-1, *size) for of in found]).bool()
         prompts = torch.tensor(self._class_of_prompt).repeat_interleave(counts).to(scores.device)
         return front_segments(masks, prompts, scores)
-
-
-def text_network(config: Mapping[str, Any]) -> Any:
-    """Return a network of transformers that takes text, with random weights.
-
-    Raises:
-        SettingError: There is no such network.
-    """
-    known = architecture(config)
-    check_choice("network.config.model_type", known["model_type"], tuple(TEXT_CLASSES))
-    import transformers as hf
-
-    made = hf.AutoConfig.for_model(**known)
-    return getattr(hf, TEXT_CLASSES[known["model_type"]])(made)
-
-
-def without_text(network: Any) -> Any:
-    """Remove the parts of a network that only embed text."""
-    for name in _TEXT_TOWER[network.config.model_type]:
-        parent, _, part = name.rpartition(".")
-        delattr(network.get_submodule(parent), part)
-    return network
-
-
-def without_layers(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a config whose text tower, which is built and removed, has no layers."""
-    return {**config, "text_config": {**config["text_config"], "num_hidden_layers": 0}}

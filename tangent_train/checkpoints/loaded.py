@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -20,13 +21,16 @@ from datamodules.core.inputs import Input, Normalization, channel_names
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
 from models.pretrained import load_tensors
+from models.prompted import PromptedNetwork
 from tangent_train.checkpoints.outputs import OutputNetwork
 from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
+from tangent_train.config.settings import Prompts, texts_of_classes
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
 from tangent_train.files import checked_file, load_plain
 from tangent_train.geometry.camera import half_width
 from tangent_train.io.gpano import Fill
+from tangent_train.io.image_files import composed
 from tangent_train.kinds import DepthKind, ScoreKind, depth_channels
 
 METADATA_KEY = "tangent_train"
@@ -180,6 +184,37 @@ class LoadedNetwork(NetworkDescription):
             return self.module
         count = len(self.class_names) - 1
         return OutputNetwork(self.module, count, self.groups, tile, self.score_kind).eval()
+
+    def prompted(
+        self, prompts: Prompts | None = None, threshold: float | None = None
+    ) -> LoadedNetwork:
+        """Return the network with other texts as classes; its `module` is changed.
+
+        Args:
+            prompts: Texts that name the classes; texts of each class by its name; or a ``.txt``
+                file with a text per line. None to keep them.
+            threshold: Probability that a class must exceed; None to keep it.
+
+        Raises:
+            SettingError: The network takes no text.
+        """
+        if prompts is None and threshold is None:
+            return self
+        if not isinstance(self.module, PromptedNetwork):
+            found, expected = "a network without text", "CLIPSeg or SAM 3 of tangent-import"
+            raise SettingError("checkpoint, with prompts=", found=found, expected=expected)
+        texts = None if prompts is None else texts_of_classes(prompts)
+        settings = {**(self.settings or {}), **self.module.set_prompts(texts, threshold)}
+        if texts is None:
+            return replace(self, settings=settings)
+        names = tuple(map(composed, texts))
+        return replace(
+            self,
+            class_names=("unknown", *names),
+            groups=tuple((k,) for k in range(len(names) + 1)),
+            things=names if self.things else (),
+            settings=settings,
+        )
 
 
 def completed_settings(

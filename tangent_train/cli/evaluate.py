@@ -44,6 +44,7 @@ def evaluate(settings: EvaluateSettings) -> None:
         refuse_typed(("data", "experiment", "panels"), "nothing: input= has no labels")
     checkpoint: Any = settings.checkpoint
     loaded = load_network(checkpoint, settings.trust)
+    loaded = loaded.prompted(settings.prompts, settings.threshold)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
     head: Any = get_class(settings.task["head"]["_target_"])
     loaded.check_predicts(head.kind, remedy)

@@ -77,7 +77,8 @@ def _load(settings: ImportSettings) -> PhotoNetwork:
         expected = f"a value, for library={settings.library or 'null'}"
         raise SettingError(needed, found="null", expected=expected)
     network = load(**given)
-    unread = {"threshold"} if settings.prompts is None else {"classes", "depth", "things"}
+    unread = set[str]() if settings.prompts is None else {"classes", "depth", "things"}
+    unread |= {"threshold"} - (network.settings or {}).keys()
     read = (_READ | given.keys()) - unread
     check_read(settings, (read | _OF_CLASSES) if network.depth_kind is None else read - {"classes"})
     return network

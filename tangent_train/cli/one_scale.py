@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from itertools import groupby
 from pathlib import Path, PurePath
 from typing import Any, Literal
@@ -13,14 +12,11 @@ import torch
 
 from tangent_train.console import print_text
 from tangent_train.errors import listed
-from tangent_train.geometry import PanoramaPose
-from tangent_train.heads.scales import frame_scales, pose_scales
+from tangent_train.heads.distance import POSE_UNIT
+from tangent_train.heads.scales import Scales, frame_scales, pose_scales
 from tangent_train.io.jobs import Job
 from tangent_train.keypoints.colmap import poses_from
 from tangent_train.rendering.resampling import resize
-
-_MOST_LOG_SCALE = 3.0
-"""Logarithm of a scale above which nothing determines it: without parallax, all large ones fit."""
 
 
 class OneScale:
@@ -48,29 +44,30 @@ class OneScale:
         Args:
             facts: Facts about all images, in their order.
         """
-        poses: dict[str, PanoramaPose] = {}
+        self.facts = {name: {**of, "scale": None} for name, of in facts.items()}
         groups = [[*names] for _, names in groupby(facts, lambda name: PurePath(name).parent)]
+        known, unit = dict[str, Any](), dict[str, str]()
+        fit: Callable[..., Scales] = frame_scales
         if isinstance(self._across, Path):
-            read = poses_from(self._across)
-            poses = {str(PurePath(file).with_suffix("")): pose for file, pose in read.items()}
-            groups = [[name for name in facts if name in poses]]
-        scales: dict[str, float] = {}
-        for group in (group for group in groups if len(group) > 1):
-            maps = [resize(np.load(self.file(name)), (128, 256), "nearest") for name in group]
-            of_group = [poses[name] for name in group if name in poses]
-            fit = partial(pose_scales, poses=of_group) if of_group else frame_scales
-            found, steps = fit(np.stack(maps))
-            if np.abs(np.log(found)).max() > _MOST_LOG_SCALE:
-                continue
-            scales |= zip(group, found.tolist(), strict=True)
-            text = "{:.1%} before, {:.1%} after".format(*steps)
-            print_text(f"One scale for {len(group)} images: median step between them {text}.")
-        if alone := [name for name in facts if name not in scales]:
+            poses = poses_from(self._across)
+            known = {str(PurePath(file).with_suffix("")): of for file, of in poses.items()}
+            groups = [[name for name in facts if name in known]]
+            fit, unit = pose_scales, {"unit": POSE_UNIT}
+        for names in (names for names in groups if len(names) > 1):
+            maps = [resize(np.load(self.file(name)), (128, 256), "nearest") for name in names]
+            of_names = zip(*(known[name] for name in names if name in known), strict=True)
+            found, steps = fit(np.stack(maps), *of_names)
+            for name, scale in zip(names, found.tolist(), strict=True):
+                if scale > 0:
+                    self.facts[name] |= {"scale": scale, **unit}
+            if count := np.sum(found > 0):
+                text = "{:.1%} before, {:.1%} after".format(*steps)
+                print_text(f"One scale for {count} images: median step {text}.")
+        if alone := [name for name, of in self.facts.items() if of["scale"] is None]:
             print_text(f"Nothing determines the scale of {listed(alone)}.")
-        self.facts = {name: {**of, "scale": scales.get(name, 1.0)} for name, of in facts.items()}
 
     def scaled(self, job: Job, _: Callable[[float], object]) -> tuple[Any, ...]:
         """Return an image at its scale, as the prediction does."""
         facts = self.facts[job.name]
-        pixels = np.load(self.file(job.name)) * np.float32(facts["scale"])
+        pixels = np.load(self.file(job.name)) * np.float32(facts["scale"] or 1)
         return job.value, (torch.from_numpy(pixels), facts)

@@ -54,7 +54,7 @@ def predict(settings: PredictSettings) -> None:
     done = len(shard.part(names)) - len(missing)
     print_text(f"{counted(len(missing) + done, 'images')}, {done} done already.")
     prediction.shown = {names[k] for k in evenly_spread(settings.report, len(names))}
-    errors = _work("Predicting", inputs, missing, manifest, prediction.predict, prediction)
+    errors = prediction.work("Predicting", prediction.predict, inputs, missing, manifest)
     manifest = Manifest.open(settings.output, same)  # with what other shards have finished
     left = manifest.missing(names)
     if left and not errors.keys() >= set(left):
@@ -63,7 +63,7 @@ def predict(settings: PredictSettings) -> None:
         finished = [name for name in names if name not in left]
         if second := prediction.one_scale:
             second.fit({name: manifest.finished[name][folder.head.summary] for name in finished})
-            errors |= _work("Scaling", inputs, finished, manifest, prediction.scaled, prediction)
+            errors |= prediction.work("Scaling", prediction.scaled, inputs, finished, manifest)
         errors |= _write_videos(inputs, folder, manifest)
         entries = [{"name": n, **manifest.finished.get(n, errors.get(n, {}))} for n in names]
         folder.write_summary(content, entries)
@@ -79,26 +79,6 @@ def predict(settings: PredictSettings) -> None:
     if errors:
         total = len(missing) + done
         sys.exit(f"tangent-predict: {len(errors)} of {total} images could not be used, see above")
-
-
-def _work(
-    title: str,
-    inputs: Inputs,
-    names: Collection[str],
-    manifest: Manifest,
-    step: Callable[..., Any],
-    prediction: _Prediction,
-) -> dict[str, dict[str, Any]]:
-    """Do a step of the work on some images, and write the results; return errors by name."""
-    errors: dict[str, dict[str, Any]] = {}
-    steps = step, prediction.read, prediction.write
-    with closing(work_on(title, inputs.jobs(names), len(names), *steps)) as jobs:
-        for job in jobs:
-            if job.error:
-                errors[job.name] = {"file": str(job.path), **job.place, "error": job.error}
-            else:
-                manifest.finish(job.name, file=str(job.path), **job.value)
-    return errors
 
 
 def _write_videos(
@@ -127,7 +107,8 @@ class _Prediction:
     """
 
     def __init__(self, settings: PredictSettings) -> None:
-        original = loaded = load_network(settings.checkpoint, settings.trust)
+        original = load_network(settings.checkpoint, settings.trust)
+        original = loaded = original.prompted(settings.prompts, settings.threshold)
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
@@ -170,6 +151,19 @@ class _Prediction:
             raise SettingError("depth", found="null", expected=expected)
         of_file = settings.depth_scale, settings.depth_channel
         self._depth = images.DepthFolder(settings.depth, *of_file) if settings.depth else None
+
+    def work(
+        self, title: str, step: Any, inputs: Inputs, names: Collection[str], manifest: Manifest
+    ) -> dict[str, dict[str, Any]]:
+        """Take a step of the work on some images, and write the results; return errors by name."""
+        errors, steps = dict[str, dict[str, Any]](), (step, self.read, self.write)
+        with closing(work_on(title, inputs.jobs(names), len(names), *steps)) as jobs:
+            for job in jobs:
+                if job.error:
+                    errors[job.name] = {"file": str(job.path), **job.place, "error": job.error}
+                else:
+                    manifest.finish(job.name, file=str(job.path), **job.value)
+        return errors
 
     def read(self, job: Job) -> images.InputImage:
         """Read one image."""
@@ -251,7 +245,7 @@ class _Prediction:
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     """Return the names of the settings that are read besides those of the head."""
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
-    names |= {"levels", "base_level", "blend", "write", "report", "shard"}
+    names |= {"levels", "base_level", "blend", "write", "report", "shard", "prompts", "threshold"}
     names |= {"view_batch_size", "compile", "device", "trust"}
     panoramas = {"area", "eye", "fill", "views", "upright", "mask", "rotations"}
     if loaded.predicts == DISTANCE:

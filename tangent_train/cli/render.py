@@ -53,7 +53,7 @@ from tangent_train.io.tangent_folders import (
     write_views,
 )
 from tangent_train.io.videos import read_video_tags
-from tangent_train.keypoints.colmap import model_points, poses_from
+from tangent_train.keypoints.colmap import is_model, model_points, poses_from
 from tangent_train.manifest import Manifest
 from tangent_train.rendering.representations.pinhole import ring_size
 from tangent_train.rendering.resampling import resize
@@ -144,7 +144,8 @@ def _world(settings: RenderSettings, names: Sequence[str]) -> tuple[dict[str, Pa
     A single panorama, called "", defines the world.
     """
     if (path := settings.poses) is not None:
-        return poses_from(path, settings.cameras), model_points(path) if path.is_dir() else None
+        poses = {file: pose for file, (pose, _) in poses_from(path, settings.cameras).items()}
+        return poses, model_points(path) if is_model(path) else None
     if len(names) > 1:
         expected = f"poses of the {len(names)} panoramas: a COLMAP model, or a JSON file"
         raise SettingError("poses", found="null", expected=expected)
@@ -245,7 +246,7 @@ def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
     model, output = settings.poses or Path(), settings.output
     check_new(output, overwrite=settings.overwrite)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
-    poses = poses_from(model, settings.cameras)
+    poses = {file: pose for file, (pose, _) in poses_from(model, settings.cameras).items()}
     write_poses(output, poses)
     count = counted(len(rig.panoramas), "panoramas")
     print_text(f"Written: {output}, poses of {len(poses)} of {count}")

@@ -183,7 +183,8 @@ def _data(settings: FilesSettings, rows: int | None) -> Any:
     """Build the data module; without a number of rows its panoramas have those of the first."""
     views = {"_target_": "tangent_train.rendering.EquirectRepresentation", "level": 0}
     section = views | {"erp_height": rows or 2}
-    data = build_data(settings.model_copy(update={"representation": section}))
+    changes = {"representation": section, "data": {**settings.data, "inputs": ["rgb"]}}
+    data = build_data(settings.model_copy(update=changes))
     if not isinstance(data, PanoramaDataModule):
         raise SettingError("data", found=type(data).__name__, expected="panoramas, not photos")
     images: Any = ()

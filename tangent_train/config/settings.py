@@ -45,11 +45,29 @@ _Item = TypeVar("_Item")
 OneOrMore = Annotated[tuple[_Item, ...], BeforeValidator(_as_list)]
 """A list; a single value is a list of it."""
 
+
+def texts_of_classes(value: Any) -> dict[str, Sequence[str]]:
+    """Return the texts of each class by its name; texts of a list or a .txt file are classes."""
+    if not isinstance(value, Mapping):
+        texts = [*map(str, _as_list(value))]
+        if len(texts) == 1 and texts[0].endswith(".txt"):
+            lines = Path(texts[0]).read_text(encoding="utf-8").splitlines()
+            texts = [*filter(None, map(str.strip, lines))]
+        value = {text: text for text in texts}
+    if not (value and all(value.values())):
+        raise ValueError("a text for each class")
+    return {name: _as_list(texts) for name, texts in value.items()}
+
+
+Prompts = Annotated[Mapping[str, Sequence[str]] | Sequence[str], BeforeValidator(texts_of_classes)]
+"""Texts of each class by its name, see `texts_of_classes`."""
+
 Level = Annotated[int, Field(ge=0, le=14)]
 Rows = Annotated[int, Field(gt=0, le=2**15)]
 ExistingPath = FilePath | DirectoryPath
 FieldOfView = Annotated[float, Field(gt=0, lt=180)]
 Share = Annotated[float, Field(ge=0, le=1)]
+Threshold = Annotated[float, Field(gt=0, lt=1)]
 Section = dict[str, Any]
 """Settings of an option of a group."""
 
@@ -93,6 +111,18 @@ class LabelMapSettings(Settings):
     never (take the best class in the map)"""
 
 
+class PromptSettings(LabelMapSettings):
+    """Settings of commands that take a network of tangent-import prompts= with other texts."""
+
+    # --- classes ---
+    prompts: Prompts | None = None
+    """CLIPSeg and SAM 3: other texts that name the classes, as in tangent-import; null = as in the
+    checkpoint"""
+    threshold: Threshold | None = None
+    """CLIPSeg and SAM 3: probability that a class must exceed, else pixels are unknown; null = as
+    in the checkpoint"""
+
+
 class ImageSettings(Settings):
     """Settings of commands that read images and videos."""
 
@@ -107,7 +137,7 @@ class ImageSettings(Settings):
     stereo"""
 
 
-class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
+class PredictSettings(PromptSettings, ImageSettings, NetworkSettings):
     """Settings of tangent-predict."""
 
     not_content = ("output", "report", "shard", "view_batch_size", "compile", "device", "trust")
@@ -157,8 +187,9 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 
     align_across: Literal["frames"] | ExistingPath | None = None
     """depth: bring all panoramas to one scale: frames (of a video, or of a folder in order, each
-    near the next) | their poses, in whose unit depth is then (the JSON file of tangent-render
-    poses=, or a folder of a sparse COLMAP model); null = each has its own"""
+    near the next) | their poses, in whose unit depth is then (folder of a sparse COLMAP model, JSON
+    file of tangent-render poses=, CSV file, or folder of tran.txt and rot.txt); null = each has its
+    own"""
 
     # --- output ---
     output: Path
@@ -255,7 +286,7 @@ class RenderSettings(ImageSettings):
     classes.json)"""
     poses: ExistingPath | None = None
     """folder of a sparse COLMAP model, whose poses of panoramas are written as JSON; with
-    nerfstudio=true, it or the JSON file"""
+    nerfstudio=true, also the JSON file or other poses"""
 
     # --- Nerfstudio ---
     nerfstudio: bool = False
@@ -323,20 +354,22 @@ class ImportSettings(Settings):
 
     # --- classes ---
     classes: ExistingPath | None = None
-    """JSON list of class names in the order of the outputs; null = from the model"""
+    """JSON list of class names in the order of the outputs (Mask R-CNN: background first); null =
+    from the model, or prompts="""
     unknown_classes: OneOrMore[str] = ()
     """classes that mean unknown, e.g. [background]"""
     unknown_wins: bool = True
     """pixels whose best class is one of unknown_classes: true = unknown (label 0) | false = the
     best other class"""
-    prompts: dict[str, OneOrMore[str]] | OneOrMore[str] | None = None
+    prompts: Prompts | None = None
     """texts that name the classes, for CLIPSeg and SAM 3 of huggingface: [chair,"picture frame"] |
-    {seating: [chair, sofa], window: window} | a file with a text per line"""
-    threshold: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    """with prompts: probability that a class must exceed; elsewhere pixels are unknown"""
+    {seating: [chair, sofa], window: window} | prompts.txt with a text per line"""
+    threshold: Threshold | None = None
+    """with prompts=: probability that a class must exceed, else pixels are unknown; Mask R-CNN:
+    score that an object must exceed; null = 0.5"""
     things: OneOrMore[str] = ()
     """classes of which the network also returns objects, e.g. [chair,table], or all; for universal
-    networks of huggingface"""
+    networks of huggingface (Mask R-CNN and SAM 3 return those of all classes)"""
 
     # --- photos and views ---
     normalization: str | dict[str, tuple[float, ...]] | None = None
@@ -517,7 +550,7 @@ class FilesSettings(RunSettings):
         return self
 
 
-class EvaluateSettings(LabelMapSettings, NetworkSettings, FilesSettings):
+class EvaluateSettings(PromptSettings, NetworkSettings, FilesSettings):
     """Settings of tangent-evaluate."""
 
     not_read: ClassVar[Sequence[str]] = (

@@ -101,7 +101,6 @@ class Head(nn.Module, ABC):
         num_outputs: Number of channels of the network's output.
         predict_settings: Settings of ``tangent-predict`` that are arguments of the head, each with
             the kind of output or the other setting that it needs; "" for none.
-        is_metric: False for distances that are known up to a scale.
         consistency: Scores of `agreement` of each image ``(images,)``, by name of the column, if
             they are measured.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind (`source`)
@@ -124,7 +123,6 @@ class Head(nn.Module, ABC):
     usual_kinds: ClassVar[Sequence[str]] = PICTURES
     waits: ClassVar[bool] = False
     num_outputs: int
-    is_metric: bool = True
     consistency: Mapping[str, NDArray[np.float64]] = NOTHING
     suffixes: Mapping[str, str] = NOTHING
     summary_columns: Sequence[str] = ()
@@ -283,12 +281,11 @@ class Head(nn.Module, ABC):
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write the predicted pixels and the pictures of one image, by kind."""
-        image, pixels, _ = predicted
         for kind, file in files.items():
             if kind == self.source:
-                self.write_source(file, pixels)
+                self.write_source(file, predicted.pixels)
             elif kind in PICTURES:
-                write_pixels(file, self.picture(kind, image.cut(image.rgb), pixels))
+                write_pixels(file, self.picture(kind, predicted))
 
     def write_source(self, file: Path, pixels: NDArray[Any]) -> None:
         """Write predicted pixels."""
@@ -310,9 +307,10 @@ class Head(nn.Module, ABC):
     def limits(self, summaries: Sequence[Any]) -> Any:
         """Return the ends of the color scale of a video, given the summaries of its frames."""
 
-    def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> Any:
-        """Return the picture of a single image with its legend, see `paint`."""
-        return self.paint(kind, rgb, pixels)
+    def picture(self, kind: str, predicted: PredictedImage) -> Any:
+        """Return the picture of a single image, to which heads add a legend, see `paint`."""
+        image, pixels, _ = predicted
+        return self.paint(kind, image.cut(image.rgb), pixels)
 
     def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
         """Return the maps of one image in the report, by argument of `encode_image`."""

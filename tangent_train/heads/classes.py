@@ -250,12 +250,12 @@ class ClassesHead(Head):
             return class_colors(self.class_names)[self.labels_in(pixels)]
         return pictures.mixed_picture(rgb, self.labels_in(pixels), self.class_names, pixels)
 
-    def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> RGB:
+    def picture(self, kind: str, predicted: PredictedImage) -> RGB:
         """Return a picture; an overlay has a legend of the classes."""
-        painted = self.paint(kind, rgb, pixels)
+        painted: RGB = super().picture(kind, predicted)
         if kind == "color":
             return painted
-        labels = self.labels_in(pixels)
+        labels = self.labels_in(predicted.pixels)
         return pictures.with_class_legend(painted, labels[labels > 0], self.class_names)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:

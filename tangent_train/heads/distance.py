@@ -53,6 +53,15 @@ _WORSE = 1.01
 _SAMPLES = 2**16
 """Pixels whose median is that of an image."""
 
+POSE_UNIT = "unit of poses"
+"""Unit of distances whose scale is that of known poses."""
+
+_UNITS = {
+    "m": "depth in meters",
+    "relative": "relative: median distance 1",
+    POSE_UNIT: "depth in the unit of the poses",
+}
+
 _ROWS = {
     "known": "known pixels, % of the solid angle",
     "too_far": "too far for 16 bits, unknown in depth files, %",
@@ -332,10 +341,19 @@ class DistanceHead(Head):
         near, far = zip(*ranges, strict=True) if ranges else ([1.0], [2.0])
         return min(near), max(far)
 
-    def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> RGB:
+    def picture(self, kind: str, predicted: PredictedImage) -> RGB:
         """Return the colored depth with a bar of its colors."""
-        limits, unit = pictures.distance_limits(pixels), "m" if self.is_metric else "relative"
-        return pictures.with_distance_legend(self.paint(kind, rgb, pixels, limits), limits, unit)
+        limits, unit = pictures.distance_limits(predicted.pixels), self._unit(predicted)
+        painted = self.paint(kind, predicted.image.rgb, predicted.pixels, limits)
+        return pictures.with_distance_legend(painted, limits, unit)
+
+    def _unit(self, predicted: PredictedImage) -> str:
+        return str(predicted.facts.get("unit", "m" if self.is_metric else "relative"))
+
+    def report_maps(self, predicted: PredictedImage) -> dict[str, Any]:
+        """Return distances and their unit; evaluations align them with true ones, in meters."""
+        unit = predicted.facts.get(self.summary, {}).get("unit", "m")
+        return {**super().report_maps(predicted), "unit": unit}
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return unit, shares of the solid angle, distances, range of the colors, alignment."""
@@ -345,7 +363,7 @@ class DistanceHead(Head):
             np.sum(angles, where=mask) / total for mask in (np.isfinite(depth), depth > self._most)
         )
         facts = {**predicted.facts, "known": known, "too_far": too_far}
-        summary: dict[str, Any] = {"unit": "m" if self.is_metric else "relative"}
+        summary: dict[str, Any] = {"unit": self._unit(predicted)}
         if known:
             median = np.median(depth[tuple(spread_pixels(predicted, _SAMPLES))])
             facts |= {"nearest": np.nanmin(depth), "median": median, "farthest": np.nanmax(depth)}
@@ -358,7 +376,8 @@ class DistanceHead(Head):
 
     def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], list[list[str]]]:
         """Return the means of the summaries over the images."""
-        rows, unit = [], ", m" if self.is_metric else ""
+        rows, units = [], {of["unit"] for of in summaries}
+        unit = ", m" * (units == {"m"})
         for name, title in _ROWS.items():
             values = [value for of in summaries if (value := of.get(name)) is not None]
             if any(values) or (name == "known" and values):
@@ -369,7 +388,7 @@ class DistanceHead(Head):
             rows.append(
                 ["images whose views agree less than before: try another align", str(worse)]
             )
-        kind = "depth in meters" if self.is_metric else "relative: median distance 1"
+        kind = ", ".join(text for unit, text in _UNITS.items() if unit in units)
         return f"Mean over the images ({kind})", ["quantity", "mean"], rows
 
 

@@ -30,8 +30,12 @@ from tangent_train.heads.alignment import matrix_rows, robust_fit
 _DIRECTIONS = lonlat_to_xyz(xyz_to_lonlat(icosphere(4).vertices))
 _COMMON = np.linspace(-3, 3, 25)
 """Logarithms of common scales of all panoramas that are tried as a start."""
+_MOST_STEP = 0.8
+"""Step with parallax, divided by the step without it, above which nothing determines the unit."""
 _FAR = 12.0
 """Logarithm of a scale at which there is no parallax."""
+_LEAST_POINTS = 30
+"""Points below which a median is not taken: with errors of 20 %, its error is about 5 %."""
 _NEIGHBORS = 4
 """Nearest panoramas with which one is compared."""
 
@@ -55,13 +59,21 @@ def frame_scales(distances: NDArray[np.floating]) -> Scales:
     return np.exp(logs), (np.nanmedian(np.abs(steps)), np.nanmedian(np.abs(after)))
 
 
-def pose_scales(distances: NDArray[np.floating], poses: Sequence[PanoramaPose]) -> Scales:
-    """Return the scales of panoramas in the unit of their poses.
+def pose_scales(
+    distances: NDArray[np.floating],
+    poses: Sequence[PanoramaPose],
+    points: Sequence[Floats] = (),
+) -> Scales:
+    """Return the scales of panoramas in the unit of their poses; NaN where nothing determines them.
 
     Args:
-        distances: See `frame_scales`; n ≥ 2.
+        distances: See `frame_scales`.
         poses: Poses of the panoramas.
+        points: Points ``(m, 3)`` that each panorama sees, of which some may be wrong. If there are
+            any, they determine the scales, instead of the parallax.
     """
+    if any(map(len, points)):
+        return _point_scales(distances, poses, points)
     count, numbers = len(distances), np.arange(len(distances))
     centers = np.stack([pose.location_m for pose in poses])
     axes = np.stack([pose.world_from_panorama for pose in poses])
@@ -90,7 +102,26 @@ def pose_scales(distances: NDArray[np.floating], poses: Sequence[PanoramaPose]) 
     logs = robust_fit(lambda logs: compare(logs + _FAR), start)
     logs = logs - np.median(logs)
     logs = robust_fit(compare, logs + min(_COMMON, key=lambda common: step(logs + common)))
-    return np.exp(logs), (step(start), step(logs))
+    steps = step(start), step(logs)
+    if steps[1] > _MOST_STEP * step(logs - np.median(logs) + _FAR):
+        logs = np.full(count, np.nan)
+    return np.exp(logs), steps
+
+
+def _point_scales(
+    distances: NDArray[np.floating], poses: Sequence[PanoramaPose], points: Sequence[Floats]
+) -> Scales:
+    """Return the medians of the quotients of the distances of points and of the panoramas."""
+    logs, steps = np.full(len(poses), np.nan), []
+    for number, (pose, of_model) in enumerate(zip(poses, points, strict=True)):
+        directions, far = pose.project(of_model)
+        found = np.log(far / _at(distances, number, directions))
+        found = found[np.isfinite(found)]
+        if len(found) >= _LEAST_POINTS:
+            logs[number] = np.median(found)
+            steps.append(np.abs([found, found - logs[number]]))
+    before, after = np.median(np.hstack(steps), axis=1) if steps else (np.nan, np.nan)
+    return np.exp(logs), (before, after)
 
 
 def _at(distances: NDArray[np.floating], images: Any, directions: Floats) -> Floats:

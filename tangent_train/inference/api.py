@@ -40,6 +40,7 @@ from datamodules.core.label_map import (
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.config.build import checks_types
+from tangent_train.config.settings import Prompts, Threshold
 from tangent_train.errors import SettingError, at_least, check_choice, check_type, width_height
 from tangent_train.files import label_map_file
 from tangent_train.geometry import PinholeGrid
@@ -90,12 +91,15 @@ class LabelSettings(ImageSettings, total=False):
 
     depth: Depth
     max_tilt_deg: float
+    prompts: Prompts | None
 
 
 @checks_types
 def load(
     path: str | Path,
     *,
+    prompts: Prompts | None = None,
+    threshold: Threshold | None = None,
     label_map: str | Path | None = None,
     unmapped: Unmapped = "unknown",
     device: str | int | torch.device = "cpu",
@@ -117,6 +121,10 @@ def load(
 
     Args:
         path: A checkpoint, or a file written by ``tangent-export`` or ``tangent-import``.
+        prompts: Other texts that name the classes of CLIPSeg or SAM 3, e.g. ``["chair", "table"]``
+            or ``{"seat": ["chair", "sofa"]}``, or a ``.txt`` file with a text per line.
+        threshold: Probability that a class of prompts must exceed, else pixels are unknown; None as
+            imported.
         label_map: Map to the classes of another data set: its name or a JSON file, see
             `load_label_map`.
         unmapped: Treatment of classes that are not in the map: ``unknown`` gives label 0 where they
@@ -147,15 +155,21 @@ def load(
         SettingError: A setting does not suit the network.
     """
     check_type("path", path, (str, Path), "the path of a network's file")
-    original = loaded = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
-    if label_map is not None:
-        loaded = map_classes(original, load_label_map(label_map), unmapped).loaded
+    of_file = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
     # A setting of another head is an unexpected argument.
-    given = {"min_confidence": min_confidence, "align": align}
-    head = head_of(loaded, **{name: value for name, value in given.items() if value})
-    selector = ViewSelector(loaded, levels, base_level, blend, rotations, views, fill)
-    predictor = Predictor(loaded, head, selector, device, view_batch_size, compile)
-    return Network(loaded, predictor, UpLikelihood(original, predictor.device))
+    of_head = {"min_confidence": min_confidence, "align": align}
+    of_head = {name: value for name, value in of_head.items() if value}
+    chosen = levels, base_level, blend, rotations, views, fill
+
+    def prepared(original: LoadedNetwork) -> tuple[LoadedNetwork, Predictor]:
+        loaded = original
+        if label_map is not None:
+            loaded = map_classes(original, load_label_map(label_map), unmapped).loaded
+        selector = ViewSelector(loaded, *chosen)
+        of_device = device, view_batch_size, compile
+        return loaded, Predictor(loaded, head_of(loaded, **of_head), selector, *of_device)
+
+    return Network(of_file.prompted(prompts, threshold), prepared)
 
 
 class Network:
@@ -166,9 +180,8 @@ class Network:
     size of the image: tensors on the same device for tensors, else arrays.
 
     Args:
-        loaded: The network.
-        predictor: Predicts panoramas and photos.
-        up_likelihood: Evidence for the direction of up, from the network's confidence.
+        original: The network, with its own classes.
+        prepared: Returns the network with the classes of a label map, and its predictor.
 
     Attributes:
         loaded: The network, with its inputs, level and representation.
@@ -177,12 +190,20 @@ class Network:
     """
 
     def __init__(
-        self, loaded: LoadedNetwork, predictor: Predictor, up_likelihood: UpLikelihood
+        self,
+        original: LoadedNetwork,
+        prepared: Callable[[LoadedNetwork], tuple[LoadedNetwork, Predictor]],
     ) -> None:
-        self.loaded = loaded
-        self.class_names = loaded.class_names
-        self.palette = class_colors(tuple(loaded.class_names))
-        self._predictor, self._up_likelihood = predictor, up_likelihood
+        self._prepared = prepared
+        self._prompts: Prompts | None = None
+        self._use(original)
+
+    def _use(self, original: LoadedNetwork) -> None:
+        self._original = original
+        self.loaded, self._predictor = self._prepared(original)
+        self.class_names = self.loaded.class_names
+        self.palette = class_colors(tuple(self.class_names))
+        self._up_likelihood = UpLikelihood(original, self._predictor.device)
 
     @overload
     def labels(self, image: Tensor, **settings: Unpack[LabelSettings]) -> Tensor: ...
@@ -201,6 +222,7 @@ class Network:
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
         eye: Eye | None = None,
+        prompts: Prompts | None = None,
     ) -> NDArray[Any] | Tensor:
         """Return the label of every pixel.
 
@@ -219,6 +241,8 @@ class Network:
             mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
                 a file; or 0 in an array or tensor. See `Masks`.
             eye: Eye of a stereo panorama, see `eye_part`; the labels are those of its picture.
+            prompts: Texts that become the classes of CLIPSeg or SAM 3, see `load`; the network
+                keeps them.
 
         Returns:
             ``(H, W)`` labels 1 … K, and 0 for unknown pixels: an array of uint8 (uint16 for many
@@ -229,7 +253,7 @@ class Network:
             SettingError: The image cannot be used, or the network needs another input.
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye)
+        given = self._read(image, depth, fov, area, upright, max_tilt_deg, eye, prompts)
         head: Any = self._predictor.head
         found = head.labels_in(self._predictor.predict(given).pixels().cpu().numpy())
         return _as_given(_masked(found, given, image, mask, 0), image)
@@ -330,8 +354,12 @@ class Network:
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         eye: Eye | None = None,
+        prompts: Prompts | None = None,
     ) -> InputImage:
-        """Return a photo, or a panorama with its zenith."""
+        """Return a photo, or a panorama with its zenith; set the prompts."""
+        if prompts not in (None, self._prompts):
+            self._use(self._original.prompted(prompts))
+            self._prompts = prompts
         is_given = depth is not None or "depth" in self.loaded.inputs
         of_size = partial(self._depth, depth) if is_given else None
         if fov is not None:

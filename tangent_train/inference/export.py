@@ -133,6 +133,8 @@ def _write_onnx(
             opset_version=opset,
             verbose=False,
         )
+    if len(program.model.graph.outputs) > 1:
+        raise SettingError("network", found="further outputs, e.g. a confidence", expected="one")
     program.save(path, external_data=False)
     written = replace(loaded, fixed_size=fixed, settings=None)
     if not returns_labels:  # the graph computes the logits and adds them up

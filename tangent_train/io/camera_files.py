@@ -6,11 +6,12 @@ Their world frame is right-handed: x forward (to the middle column of the panora
 
 from __future__ import annotations
 
+import csv
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -38,6 +39,11 @@ View = tuple[PinholeGrid, int]
 """An image of a grid, by its index."""
 
 _MOST_PIXELS = 2**20  # limit for rows and columns: a panorama of the size in the file is allocated
+_EXPECTED_POSES = "poses.json, a .csv file with file, x, y, z, or a folder of tran.txt and rot.txt"
+LOCATION_FILE = "tran.txt"
+"""End of the names of files with the location of a panorama."""
+
+_FROM_OPENGL = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
 _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
 """Matches lists of numbers, which are written on one line."""
 
@@ -310,16 +316,43 @@ class _PosesJson(BaseModel):
 
 
 def read_poses(path: Path) -> dict[str, PanoramaPose]:
-    """Read poses that `write_poses` wrote.
+    """Read poses of panoramas, by file.
+
+    Args:
+        path: JSON file of `write_poses`; CSV table of `file`, the location `x`, `y`, `z` and
+            optionally the rotation `qw`, `qx`, `qy`, `qz`, in the axes of `write_poses`; or folder
+            whose ``…tran.txt`` and ``…rot.txt`` are location and rotation of ``…rgb.png``, in
+            OpenGL's axes (x right, y up, z back), as of PanSplat.
 
     Raises:
-        DataError: The file is missing, or has other content.
+        DataError: A file is missing, or has other content.
     """
-    content: _PosesJson = read_json(path, "poses as of tangent-render poses=", kind=_PosesJson)
-    return {
-        pose.file: PanoramaPose(to_right_handed(pose.world_from_panorama), pose.location)
-        for pose in content.panoramas
-    }
+    if path.is_file() and path.suffix != ".csv":
+        content: _PosesJson = read_json(path, _EXPECTED_POSES, kind=_PosesJson)
+        poses = [(pose.file, pose.world_from_panorama, pose.location) for pose in content.panoramas]
+    else:
+        try:
+            poses = [*(_folder_poses if path.is_dir() else _table_poses)(path)]
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            raise DataError(path, found=error, expected=_EXPECTED_POSES) from error
+    return {file: PanoramaPose(to_right_handed(axes), location) for file, axes, location in poses}
+
+
+def _table_poses(path: Path) -> Iterator[tuple[str, Any, Any]]:
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    for row in csv.DictReader(path.read_text("utf-8-sig").splitlines()):
+        quaternion = [float(row.get(f"q{axis}", axis == "w")) for axis in "wxyz"]
+        axes = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+        yield row["file"], axes, [float(row[axis]) for axis in "xyz"]
+
+
+def _folder_poses(path: Path) -> Iterator[tuple[str, Any, Any]]:
+    for file in sorted(path.rglob("*" + LOCATION_FILE)):
+        prefix = str(file).removesuffix(LOCATION_FILE)
+        axes = checked_rotation(np.loadtxt(f"{prefix}rot.txt"))
+        name = PurePath(prefix + "rgb.png").relative_to(path).as_posix()
+        yield name, _FROM_OPENGL @ axes @ _FROM_OPENGL.T, _FROM_OPENGL @ np.loadtxt(file)
 
 
 def _write_json(path: Path, content: Any) -> None:

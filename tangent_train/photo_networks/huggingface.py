@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
@@ -22,9 +21,9 @@ from models.huggingface import (
     image_processor_class,
     network_types,
 )
-from models.prompted import text_network, without_layers, without_text
+from models.prompted import TEXT_CLASSES
 from tangent_train.config.from_file import build_from_file
-from tangent_train.errors import DataError, SettingError, first_line, listed
+from tangent_train.errors import DataError, SettingError, check_choice, first_line, listed
 from tangent_train.files import read_json
 from tangent_train.imports import hide_output, offline
 from tangent_train.kinds import DepthKind
@@ -36,9 +35,6 @@ from tangent_train.photo_networks.network import (
     saved_folder,
     tensors_in,
 )
-
-Prompts = Mapping[str, Sequence[str]] | Sequence[str] | None
-"""Texts that name classes, see `prompted`."""
 
 _NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
 _TASK = "the task is "
@@ -91,8 +87,8 @@ def load(
     normalization: Any = None,
     depth: DepthKind | None = None,
     things: Sequence[str] = (),
-    prompts: Prompts = None,
-    threshold: float = 0.5,
+    prompts: Mapping[str, Sequence[str]] | None = None,
+    threshold: float | None = None,
 ) -> PhotoNetwork:
     """Load a network of transformers for semantic or universal segmentation, or for depth.
 
@@ -154,68 +150,42 @@ def load(
 
 
 def prompted(
-    folder: Path, config: Any, prompts: Prompts, threshold: float, normalization: Any
+    folder: Path, config: Any, prompts: Mapping[str, Any], threshold: Any, normalization: Any
 ) -> PhotoNetwork:
     """Load a network that finds what a text names, with the texts as classes.
 
     Args:
         folder: Folder of the model with its tokenizer.
         config: Content of its config.
-        prompts: Texts, which are the names of the classes; texts of each class by its name; or a
-            file with a text per line.
-        threshold: Probability that a class must exceed; elsewhere pixels are unknown.
+        prompts: Texts of each class by its name.
+        threshold: Probability that a class must exceed; elsewhere pixels are unknown. None for 0.5.
         normalization: See `load`.
     """
-    if not isinstance(prompts, Mapping):
-        names = tuple(prompts or ())
-        if len(names) == 1 and Path(names[0]).is_file():
-            lines = Path(names[0]).read_text(encoding="utf-8").splitlines()
-            names = tuple(filter(None, map(str.strip, lines)))
-        prompts = {name: [name] for name in names}
-    names, texts = tuple(prompts), list(prompts.values())
     config = config.get("detector_config") or config  # SAM 3 is published with its tracker
     with offline():
         described = architecture(config)
+        check_choice("model, with prompts=", described["model_type"], tuple(TEXT_CLASSES))
         processor = _processor(folder, described["model_type"])
-        whole = text_network(described).eval()
-        _load_tensors(SimpleNamespace(network=whole), tensors_in(folder), folder)
-        embeddings, is_token = _embedded(whole, folder, [text for of in texts for text in of])
-        settings = {
-            "_target_": "models.PromptedNetwork",
-            "config": without_layers(described),
-            "class_of_prompt": [k for k, of in enumerate(texts) for _ in of],
-            "num_tokens": is_token.shape[1],
-            "threshold": threshold,
-        }
-        network: Any = build_from_file(settings, "network", folder / "config.json")
-    network.network.load_state_dict(without_text(whole).state_dict())
-    network.embeddings.copy_(embeddings)
-    network.is_token.copy_(is_token)
+        tokenizer = _tokenizer(folder, "a text")
+        padding = {"pad_id": tokenizer.pad_token_id, "pad_token": tokenizer.pad_token}
+        tokenizer.backend_tokenizer.enable_padding(**padding)
+        encoded = tokenizer.backend_tokenizer.to_str().encode()
+        settings: dict[str, Any] = {"_target_": "models.PromptedNetwork", "config": described}
+        settings["tokenizer_bytes"] = len(encoded)
+        network: Any = build_from_file(settings, "network", folder / "config.json").eval()
+        _load_tensors(network, tensors_in(folder), folder)
+        network.tokenizer = torch.frombuffer(bytearray(encoded), dtype=torch.uint8)
+        settings |= network.set_prompts(prompts, threshold)
     return PhotoNetwork(
         module=network,
         settings=settings,
-        score_names=(*names, UNKNOWN_NAME),
+        score_names=(*prompts, UNKNOWN_NAME),
         normalization=Normalization.of(normalization or processor["normalization"], 3),
         image_size=network.fixed_size,
         score_kind="logits",
-        things=names if described["model_type"] == "sam3" else (),
+        things=tuple(prompts) if described["model_type"] == "sam3" else (),
         unknown=(UNKNOWN_NAME,),
     )
-
-
-@torch.no_grad()
-def _embedded(whole: Any, folder: Path, texts: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Return the embeddings of texts, and which of their tokens are not padding."""
-    if not texts:
-        raise SettingError("prompts", found="none", expected="a text for each class")
-    tokenizer = _tokenizer(folder, "a text")
-    length = whole.config.text_config.max_position_embeddings
-    how = {"padding": "max_length", "max_length": length, "truncation": True}
-    tokens = tokenizer(list(texts), return_tensors="pt", **how)
-    given = {name: tokens[name] for name in ("input_ids", "attention_mask")}
-    if whole.config.model_type == "clipseg":
-        return whole.get_conditional_embeddings(len(texts), **given), torch.ones(len(texts), 0) > 0
-    return whole.get_text_features(**given).pooler_output, tokens["attention_mask"] > 0
 
 
 def _tokenizer(folder: Path, reason: str) -> Any:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,7 @@ def load_torchvision(
     weights: Any = None,
     classes: Path | None = None,
     normalization: Any = None,
+    threshold: float | None = None,
 ) -> PhotoNetwork:
     """Load a network of ``torchvision.models.segmentation``, or Mask R-CNN.
 
@@ -62,6 +63,7 @@ def load_torchvision(
         classes: JSON file of the class names; None for the names of the weights. Of Mask R-CNN,
             the first name is that of the background.
         normalization: See `Normalization.of`; None for that of the weights.
+        threshold: Score that an object of Mask R-CNN must exceed; None for 0.5.
 
     Raises:
         DataError: The weights cannot be fetched or read, or do not fit.
@@ -76,7 +78,7 @@ def load_torchvision(
     names = tuple(chosen.meta["categories"]) if classes is None else class_names_in(classes)
     if model in MASK_RCNNS:
         file = Path(weights) if is_file else None
-        return _mask_rcnn(model, chosen, file, names, normalization)
+        return _mask_rcnn(model, chosen, file, names, normalization, threshold or 0.5)
     preset: Any = chosen.transforms()
     settings = {
         "_target_": f"torchvision.models.segmentation.{model}",
@@ -100,16 +102,17 @@ def load_torchvision(
 
 
 def _mask_rcnn(
-    model: str, chosen: WeightsEnum, file: Path | None, names: Sequence[str], normalization: Any
+    model: str, chosen: WeightsEnum, file: Path | None, names: Any, colors: Any, threshold: float
 ) -> PhotoNetwork:
     """Load Mask R-CNN, which normalizes images itself; `file` None loads the published weights."""
     labels = [k for k, name in enumerate(names) if k and name != _NO_CLASS]
-    colors = Normalization.of(normalization or "imagenet", 3)
+    colors = Normalization.of(colors or "imagenet", 3)
     settings = {
         "_target_": "models.MaskRCNN",
         "model": model,
         "num_labels": len(names),
         "labels": labels,
+        "threshold": threshold,
         "image_mean": list(colors.mean),
         "image_std": list(colors.std),
     }

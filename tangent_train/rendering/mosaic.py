@@ -126,9 +126,7 @@ class ScoreMosaic(Mosaic):
         averaged: True to keep sums of probabilities, which `probabilities` and several sets of
             views need. They are always kept with ``feather`` and with `min_confidence`.
         min_confidence: Confidence below which a pixel has no class.
-        device: See `Mosaic`.
-        backend: See `Mosaic`.
-        spare: See `Mosaic`.
+        **settings: `device`, `backend` and `spare`, see `Mosaic`.
 
     Attributes:
         has_probabilities: True if sums of probabilities are kept.
@@ -145,21 +143,11 @@ class ScoreMosaic(Mosaic):
         *,
         averaged: bool = False,
         min_confidence: float = 0.0,
-        device: torch.device | str = "cpu",
-        backend: Backend = None,
-        spare: NDArray[np.float32] | None = None,
+        **settings: Any,
     ) -> None:
         averaged = averaged or blend == "feather" or min_confidence > 0
-        super().__init__(
-            shape,
-            num_classes,
-            blend,
-            averaged=averaged,
-            softmax=True,
-            device=device,
-            backend=backend,
-            spare=spare,
-        )
+        settings |= {"averaged": averaged, "softmax": True}
+        super().__init__(shape, num_classes, blend, **settings)
         self._min_confidence = min_confidence
         self.has_probabilities = averaged
 
@@ -203,9 +191,7 @@ class MeanMosaic(Mosaic):
         channels: K.
         skips_unknown: True if pixels with a value that is not finite do not count. False if they
             make all results that depend on them NaN.
-        device: See `Mosaic`.
-        backend: See `Mosaic`.
-        dtype: See `Mosaic`.
+        **settings: `device`, `backend` and `dtype`, see `Mosaic`.
     """
 
     def __init__(
@@ -215,11 +201,9 @@ class MeanMosaic(Mosaic):
         channels: int = 1,
         *,
         skips_unknown: bool = True,
-        device: torch.device | str = "cpu",
-        backend: Backend = None,
-        dtype: torch.dtype = torch.float32,
+        **settings: Any,
     ) -> None:
-        super().__init__(shape, channels + 1, blend, device=device, backend=backend, dtype=dtype)
+        super().__init__(shape, channels + 1, blend, **settings)
         self._skips_unknown = skips_unknown
 
     def add(self, values: Tensor, views: Views) -> None:

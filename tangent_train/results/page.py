@@ -85,7 +85,7 @@ def encode_image(
     confidence: NDArray[np.floating] | None = None,
     numbers: NDArray[np.integer] | None = None,
     objects: Mapping[int, Any] | None = None,
-    is_metric: bool = True,
+    unit: str = "m",
     camera_matrix: NDArray[np.float64] | None = None,
     sphere: bool = True,
     note: str = "",
@@ -106,7 +106,7 @@ def encode_image(
         confidence: Confidence ``(h, w)`` of predicted labels, from 0 to 1.
         numbers: Numbers ``(h, w)`` of predicted objects, 0 for none; None without objects.
         objects: Row of each object in the table by its number.
-        is_metric: True for distances in meters; False for distances up to a scale.
+        unit: Unit of the distances, e.g. m, or relative.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers, for points.
         sphere: True for a panorama.
         note: Line below the name.
@@ -133,7 +133,7 @@ def encode_image(
         if camera_matrix is not None:  # in widths and heights from the upper left corner
             (fx, _, cx), (_, fy, cy), _ = camera_matrix.tolist()
             camera = (fx / width, fy / height, (cx + 0.5) / width, (cy + 0.5) / height)
-        more["scale"], maps = pack_distances(maps, camera, sphere=sphere, is_metric=is_metric)
+        more["scale"], maps = pack_distances(maps, camera, sphere=sphere, unit=unit)
     if confidence is not None:
         gray = np.asarray(255 * confidence, np.uint8)
         maps["confidence"] = _shrunk(gray, _MOST_VALUES, cv2.INTER_AREA)
@@ -170,7 +170,7 @@ def pack_distances(
     camera: tuple[float, ...] | None,
     *,
     sphere: bool,
-    is_metric: bool,
+    unit: str,
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
     """Pack maps of distances on one scale, and place the scene of their points.
 
@@ -185,11 +185,11 @@ def pack_distances(
             heights from its upper left corner. None for panoramas, and for photos without a camera
             matrix, which have no points.
         sphere: True for panoramas.
-        is_metric: True for meters.
+        unit: Unit of the distances.
 
     Returns:
         Scale: distances of the values 1 (`near`) and 65535 (`far`), of the first and the last color
-        (`limits`), `is_metric` and `camera`, `center` of most points (ahead, right, up) and
+        (`limits`), `unit` and `camera`, `center` of most points (ahead, right, up) and
         `radius` around it. And images ``(h, w, 3)`` of the packed maps in OpenCV's order.
     """
     maps = {k: np.where(np.isfinite(d) & (d > 0), d, np.nan) for k, d in distances.items()}
@@ -204,7 +204,7 @@ def pack_distances(
     *_, last = maps.values()
     scale = {"near": near, "far": far, "limits": distance_limits(known)}
     scene = _scene(last, camera) if sphere or camera else {"center": (0, 0, 0), "radius": 1.0}
-    return {**scale, "is_metric": is_metric, "camera": camera, **scene}, packed
+    return {**scale, "unit": unit, "camera": camera, **scene}, packed
 
 
 def _scene(distance: NDArray[Any], camera: tuple[float, ...] | None) -> dict[str, Any]:

@@ -54,7 +54,6 @@ def encode_prediction(
         **maps,
         confidence=confidence,
         note=note,
-        is_metric=head.is_metric,
         camera_matrix=image.camera_matrix,
         sphere=image.camera_matrix is None,
     )

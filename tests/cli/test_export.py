@@ -32,19 +32,8 @@ def test_the_suffix_selects_the_format(
     assert kept == [path]  # and no folder of Hydra's
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["output=x.pt"], r"output: found '\.pt'; expected '\.onnx' or '\.safetensors'\.$"),
-        (
-            ["output=x.safetensors", "image_size=[9,9]"],
-            r"image_size: found \(9, 9\); expected multiples of 2",
-        ),
-    ],
-)
-def test_export_errors_are_one_line(
-    arguments: list[str], message: str, checkpoint: Path, tmp_path: Path, run: Run
-) -> None:
-    with pytest.raises(SystemExit, match=f"^tangent-export: {message}"):
-        run("export", f"checkpoint={checkpoint}", *arguments)
+def test_export_errors_are_one_line(checkpoint: Path, tmp_path: Path, run: Run) -> None:
+    message = r"^tangent-export: image_size: found \(9, 9\); expected multiples of 2"
+    with pytest.raises(SystemExit, match=message):
+        run("export", f"checkpoint={checkpoint}", "output=x.safetensors", "image_size=[9,9]")
     assert list(tmp_path.iterdir()) == []

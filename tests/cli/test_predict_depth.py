@@ -24,6 +24,7 @@ from tangent_train.io.pixel_files import read_depth_m, read_pixels, write_pixels
 from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import read_png
 from tests.inference.trained import sphere, write_checkpoint, write_depth_checkpoint
+from tests.keypoints.colmap_models import write_model
 from tests.results.box_room import exit_points
 from tests.running import Capture
 
@@ -189,7 +190,7 @@ def test_frames_get_one_scale(
         points = trimesh.load(tmp_path / "out" / "points" / f"{name}.ply").vertices
         farthest = np.linalg.norm(points, axis=-1).max()
         assert farthest == pytest.approx(entries[name]["depth"]["farthest"], rel=1e-3)
-    assert entries["other/d"]["depth"]["scale"] == 1
+    assert entries["other/d"]["depth"]["scale"] is None
     printed = capsys.readouterr().out
     assert "One scale for 3 images" in printed
     assert "Nothing determines the scale of other/d" in printed
@@ -201,23 +202,60 @@ def test_frames_get_one_scale(
     )
 
 
-def test_known_poses_give_their_unit(tmp_path: Path, predict: Predict) -> None:
+POSES = {
+    f"{name}.png": PanoramaPose(np.diag([1.0, -1, 1]), location)
+    for name, location in (("a", (0.5, 0.2, 0)), ("b", (-0.4, -0.2, 0.1)))
+}
+
+
+def _box(pose: PanoramaPose) -> NDArray[np.float64]:
+    """Distances in a box."""
+    rays = equirect_directions((128, 256)) @ pose.world_from_panorama.T
+    return np.linalg.norm(exit_points(pose.location_m, rays) - pose.location_m, axis=-1)
+
+
+def _write_gray(path: Path, gray: NDArray[np.float64]) -> None:
+    rgb = np.repeat(gray.round().clip(0, 255)[..., None], 3, axis=-1)
+    write_pixels(path, rgb.astype(np.uint8))
+
+
+def test_known_poses_give_their_unit(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
     """A box that the network estimates 1.6 times too large, from two places in it."""
-    poses = {
-        f"{name}.png": PanoramaPose(np.diag([1.0, -1, 1]), location)
-        for name, location in (("a", (0.5, 0.2, 0)), ("b", (-0.4, -0.2, 0.1)))
-    }
-    for name, pose in poses.items():
-        rays = equirect_directions((128, 256)) @ pose.world_from_panorama.T
-        distance = np.linalg.norm(exit_points(pose.location_m, rays) - pose.location_m, axis=-1)
-        red = 255 / 2 * np.log(distance * 1.6 / LEAST_M)
-        rgb = np.repeat(red.round().clip(0, 255)[..., None], 3, axis=-1)
-        write_pixels(tmp_path / "in" / name, rgb.astype(np.uint8))
-    write_poses(tmp_path / "poses.json", poses)
+    for name, pose in POSES.items():
+        _write_gray(tmp_path / "in" / name, 255 / 2 * np.log(_box(pose) * 1.6 / LEAST_M))
+    write_poses(tmp_path / "poses.json", POSES)
+    write_pixels(tmp_path / "in" / "elsewhere.png", sphere(64))
     given = {"align_across": tmp_path / "poses.json", "levels": 7, "write": "[depth]"}
     entries = predict(checkpoint=_network(tmp_path / "depth.ckpt", 2), **given)
     scales = [entries[name]["depth"]["scale"] for name in "ab"]
     np.testing.assert_allclose(scales, 1 / 1.6, rtol=0.05)
+    assert entries["a"]["depth"]["unit"] == "unit of poses"
+    assert entries["elsewhere"]["depth"]["unit"] == "m"
+    assert entries["elsewhere"]["depth"]["scale"] is None
+    title = "(depth in meters, depth in the unit of the poses)"
+    assert title in " ".join(capsys.readouterr().out.split())
+    assert title in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_points_of_a_model_give_their_unit(tmp_path: Path, predict: Predict) -> None:
+    """A model of 5 units per meter, for a network that estimates distances up to a scale."""
+    for name, pose in POSES.items():
+        _write_gray(tmp_path / "in" / name, 40 * _box(pose))
+    tensors = {"weight": torch.zeros(1, 3, 3, 3), "bias": torch.tensor([RGB_NORMALIZATION.mean[0]])}
+    tensors["weight"][0, 0, 1, 1] = RGB_NORMALIZATION.std[0]
+    path = tmp_path / "depth.ckpt"
+    network = write_depth_checkpoint(path, tensors=tensors, depth_kind="relative_depth")
+    scaled = {f: PanoramaPose(p.world_from_panorama, 5 * p.location_m) for f, p in POSES.items()}
+    rng = np.random.default_rng(0)
+    points = {f: 5 * exit_points(p.location_m, rng.normal(size=(99, 3))) for f, p in POSES.items()}
+    model = write_model(tmp_path / "project", scaled, points)
+    given = {"align_across": model, "views": "erp", "levels": 7, "write": "[depth,color]"}
+    entries = predict(checkpoint=network, **given)
+    for name, pose in POSES.items():
+        depth = _depth(tmp_path / "out" / "depth" / name)
+        np.testing.assert_allclose(np.median(depth / _box(pose)), 5, rtol=0.02)
+        assert entries[name[0]]["depth"]["unit"] == "unit of poses"
+    assert '"unit of poses"' in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_views_are_aligned_while_the_next_image_is_predicted(

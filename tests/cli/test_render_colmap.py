@@ -21,7 +21,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.io.camera_files import read_rig
 from tangent_train.io.pixel_files import read_pixels, write_pixels
-from tangent_train.keypoints.colmap import panorama_poses
+from tangent_train.keypoints.colmap import poses_from
 from tests.cli.rendering import Refused, render_with, smooth
 from tests.datamodules.data_files import contents, gpano_xmp
 from tests.geometry.directions import angle_deg, random_directions
@@ -230,11 +230,11 @@ def _write_model(project: Path, folder: Path) -> dict[str, tuple[Any, Any]]:
 def test_poses_of_panoramas_are_those_of_their_images(project: Path, tmp_path: Path) -> None:
     """A model whose panoramas stand where we say: x to the middle column, y to its left, z up."""
     true = _write_model(project, tmp_path / "model")
-    found = panorama_poses(tmp_path / "model", read_rig(project / "rig_config.json"))
+    found = poses_from(tmp_path / "model", project)
     assert found.keys() == true.keys() == set(NAMES)
     directions = random_directions(20)
     for name, (axes, location) in true.items():
-        points = found[name].points_m(directions, 3.0)
+        points = found[name][0].points_m(directions, 3.0)
         # In this package y is to the right of the middle column.
         expected = location + 3 * (directions * (1, -1, 1)) @ axes.T
         np.testing.assert_allclose(points, expected, atol=1e-9)

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, SettingError
 from tangent_train.io.pixel_files import write_pixels
-from tests.cli.tiny_runs import Run, results
+from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.datamodules.data_files import contents
-from tests.inference.trained import sphere, write_checkpoint
+from tests.inference.trained import sphere, write_checkpoint, write_depth_checkpoint
 from tests.running import Capture
 
 CLASSES = ["dark", "green", "bright"]
@@ -113,6 +114,29 @@ def test_files_have_the_scores_of_the_network_that_wrote_them(
     for part in ("scores", "classes", "latitude_bands", "confusion", "intervals"):
         assert found[part] == expected[part], part
     assert "report.html" in contents(tmp_path / "of_files")
+
+
+@pytest.mark.parametrize(("kind", "tolerance"), [("npy", 1e-6), ("png", 1e-3)])
+def test_depth_files_have_the_scores_of_the_network_that_wrote_them(
+    rooms: str, run: Run, tmp_path: Path, kind: str, tolerance: float
+) -> None:
+    """For synthetic rooms; PNG files have whole millimeters."""
+    weight = 0.1 * torch.randn(1, 3, 3, 3, generator=torch.Generator().manual_seed(0))
+    write_depth_checkpoint(tmp_path / "net.ckpt", tensors={"weight": weight, "bias": torch.ones(1)})
+    small = [text for text in SETTINGS if text.startswith(("data", "experiment", "level"))]
+    data = (*small, rooms, "task=depth", "panels=0")
+    run("evaluate", "checkpoint=net.ckpt", *data, "data.inputs=[rgb]", "hydra.run.dir=of_network")
+    root = rooms.partition("=")[2].strip("'")
+    how = ("output=maps", "report=0", "write=[depth]", f"depth_format={kind}")
+    run("predict", "checkpoint=net.ckpt", f"input='{root}/area_5*/pano/rgb/*.png'", *how)
+    files = [text for text in data if not text.startswith("level")]
+    run("evaluate", "predictions=maps", *files, "hydra.run.dir=of_files")
+    found, expected = (results(tmp_path / name) for name in ("of_files", "of_network"))
+    assert found["images"] == expected["images"] > 0
+    assert expected["scores"]["absrel"] > 0.01
+    for name, score in expected["scores"].items():
+        if score is not None:  # without consistency
+            assert found["scores"][name] == pytest.approx(score, rel=tolerance, abs=tolerance), name
 
 
 def test_what_is_not_scored_is_named(data: Any, run: Run, tmp_path: Path, capsys: Capture) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import shlex
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +13,7 @@ import torch
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.tasks import PixelTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
-from tests.running import ROOT, Capture, Patch, run_python
-
-CUT_SHORT = """
-import os, signal
-from tangent_train.cli.main import train
-from tangent_train.callbacks.checkpoints import LastCheckpoint
-
-original = LastCheckpoint.on_train_batch_end
-
-def cut_short(self, trainer, *rest):
-    if trainer.global_step == 2:
-        os.kill(os.getpid(), signal.SIGHUP)
-    original(self, trainer, *rest)
-
-LastCheckpoint.on_train_batch_end = cut_short
-train()
-"""
-
+from tests.running import Capture, Patch
 
 OWN_EXPERIMENT = """
 # @package _global_
@@ -82,23 +63,6 @@ def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     loaded = load_network(run_folder / "checkpoints" / "best.ckpt")
     assert loaded.class_names[:2] == ("unknown", "beam")
     assert loaded.inputs == ("rgb", "depth")
-
-
-def test_a_terminated_run_goes_on_as_if_nothing_had_happened(
-    run_folder: Path, rooms: str, tmp_path: Path, run: Run
-) -> None:
-    (tmp_path / "cut_short.py").write_text(CUT_SHORT)
-    cut = run_python(tmp_path, "cut_short.py", *SETTINGS, rooms, "hydra.run.dir=cut")
-    assert cut.returncode == 128 + signal.SIGHUP, cut.stderr
-    assert "Traceback" not in cut.stderr
-    printed = shlex.split(cut.stderr.strip().splitlines()[-1])
-    assert printed == [f"PYTHONPATH={ROOT}", "tangent-train", f"resume={tmp_path / 'cut'}"]
-    run("train", printed[-1])
-    found, expected = _last(tmp_path / "cut"), _last(run_folder)
-    for part in ("state_dict", "optimizer_states"):
-        torch.testing.assert_close(found[part], expected[part], rtol=0, atol=0)
-    assert found["lr_schedulers"] == expected["lr_schedulers"]
-    assert results(tmp_path / "cut") == results(run_folder)
 
 
 def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(

@@ -165,7 +165,7 @@ def test_headings_of_help_are_those_of_the_settings() -> None:
     assert "rotations" in found["views"]
     assert "write" in found["output"]
     assert "device" in found["performance"]
-    assert by_heading("evaluate")["classes"] == ["label_map", "unmapped"]
+    assert by_heading("evaluate")["classes"] == ["label_map", "unmapped", "prompts", "threshold"]
     assert by_heading("train")["views"] == ["level", "representation"]
 
 

@@ -90,12 +90,9 @@ def test_perspective_directions_project_to_their_pixel() -> None:
     np.testing.assert_allclose(ray_lengths(K, SIZE), 1 / directions[..., 2])
 
 
-@pytest.mark.parametrize(
-    ("size", "spans"), [((300, 760), r"\[68.32, 32.18\]"), ((760, 300), r"\[29.99, 72.32\]")]
-)
-def test_image_too_small_either_way_is_refused(size: tuple[int, int], spans: str) -> None:
+def test_an_image_too_small_is_refused() -> None:
     matrix = K.copy()
-    matrix[:2, 2] = size[1] / 2, size[0] / 2
-    expected = rf"field of view: found \[45.0, 45.0\]° for an image that spans {spans}°;"
+    matrix[:2, 2] = 760 / 2, 300 / 2
+    expected = r"field of view: found \[45.0, 45.0\]° for an image that spans \[68.32, 32.18\]°;"
     with pytest.raises(SettingError, match=expected):
-        shift_range(matrix, size, 45, (128, 128))
+        shift_range(matrix, (300, 760), 45, (128, 128))

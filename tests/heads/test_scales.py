@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from studies.depth_frames import errors
 from tangent_train.geometry import (
     PanoramaPose,
     equirect_directions,
@@ -14,6 +15,7 @@ from tangent_train.geometry import (
     to_right_handed,
 )
 from tangent_train.heads.scales import frame_scales, pose_scales
+from tests.geometry.directions import unit
 from tests.results.box_room import exit_points
 
 Floats = NDArray[np.float64]
@@ -97,3 +99,34 @@ def test_surfaces_that_one_panorama_sees_are_outliers() -> None:
     assert np.abs(_logs(found, true)).max() < 0.02
     again, _ = pose_scales(seen[::-1], [poses[5], poses[0]])
     np.testing.assert_allclose(again[::-1], found, rtol=1e-4)
+
+
+def test_points_that_panoramas_see_give_the_scale() -> None:
+    """A third of the points lies elsewhere; the last panorama sees too few of them."""
+    rng = np.random.default_rng(3)
+    (pose, *_), distances = _walk(1, turned=True)
+    true, poses = np.array([0.02, 3.0, 1.0]), [pose] * 3
+    rays = unit(rng.normal(size=(3, 300, 3)))
+    points = exit_points(pose.location_m, rays)
+    points[:, :100] += rng.normal(0, 3, (3, 100, 3))
+    seen = distances / true[:, None, None]
+    seen[0, :, 60:120] = np.nan
+    found, (_, after) = pose_scales(seen, poses, [points[0], points[1], points[2, 100:125]])
+    np.testing.assert_allclose(found, [*true[:2], np.nan], rtol=0.01)
+    assert after < 0.02
+
+
+@pytest.mark.parametrize("step_m", [0.0, 0.01])
+def test_without_parallax_nothing_determines_the_unit(step_m: float) -> None:
+    poses, distances = _walk(3, turned=False, step_m=step_m)
+    found, _ = pose_scales(distances * _smooth_errors(3, 0.1), poses)
+    assert np.isnan(found).all()
+
+
+@pytest.mark.parametrize(("step_m", "most"), [(0.1, 0.06), (0.2, 0.09)])
+def test_frames_of_walks_through_synthetic_rooms(step_m: float, most: float) -> None:
+    """Walks of 2 m past furniture, whose distances are ray-cast."""
+    for seed in range(3):
+        largest, of_neighbors = errors(np.random.default_rng(seed), step_m, 0)
+        assert largest < most
+        assert of_neighbors < 0.01

@@ -12,6 +12,7 @@ from typing import Any
 import onnx
 import onnxruntime
 import pytest
+import torch
 from safetensors import safe_open
 
 from datamodules.core.label_map import DISTANCE
@@ -131,6 +132,17 @@ def test_depth_networks_are_exported_and_read_back(suffix: str, tmp_path: Path) 
     if suffix == ".onnx":
         (output,) = onnxruntime.InferenceSession(path).get_outputs()
         assert output.name == "depth"
+
+
+def test_a_confidence_is_exported_to_safetensors_only(tmp_path: Path) -> None:
+    changes: dict[str, Any] = {"class_names": (), "predicts": DISTANCE, "depth_kind": "metric_z"}
+    trained = replace(small_trained(config_section("Sure")), **changes)
+    with pytest.raises(SettingError, match="network: found further outputs"):
+        export_network(trained, tmp_path / "net.onnx")
+    again = export_network(trained, tmp_path / "net.safetensors").loaded
+    images = some_images(trained, 2, (8, 12))
+    returned, expected = (each.network(images) for each in (again, trained))
+    assert torch.equal(returned["confidence"], expected["confidence"])
 
 
 def test_size_and_operators_of_a_file_can_be_chosen(tmp_path: Path) -> None:

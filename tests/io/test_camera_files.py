@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
 from tangent_train.geometry import PinholeGrid, RingGrid, TangentGrid, random_rotation
-from tangent_train.io.camera_files import CameraFile, read_cameras, read_rig, write_cameras
+from tangent_train.io.camera_files import (
+    CameraFile,
+    read_cameras,
+    read_poses,
+    read_rig,
+    write_cameras,
+)
 from tangent_train.rendering import equirect_to_tangent
 
 ROTATION = random_rotation(np.random.default_rng(3))
@@ -101,3 +107,50 @@ def test_other_files_are_refused(read: Any, content: bytes | None, tmp_path: Pat
         (tmp_path / "other.json").write_bytes(content)
     with pytest.raises(DataError, match=r"other\.json.*tangent-render"):
         read(tmp_path / "other.json")
+
+
+def test_a_table_of_poses(tmp_path: Path) -> None:
+    """`b` is rotated by 90° to the left; y of directions is to the right, of the table left."""
+    table = "file,x,y,z,qw,qx,qy,qz\na.png,1,2,3,1,0,0,0\nb.png,0,0,1,0.5,0,0,0.5\n"
+    (tmp_path / "poses.csv").write_text("\ufeff" + table)
+    poses = read_poses(tmp_path / "poses.csv")
+    ahead_right_up = np.eye(3)
+    found = {file: pose.points_m(ahead_right_up, 2.0) for file, pose in poses.items()}
+    np.testing.assert_allclose(found["a.png"], [(3, 2, 3), (1, 0, 3), (1, 2, 5)], atol=1e-9)
+    np.testing.assert_allclose(found["b.png"], [(0, 2, 1), (2, 0, 1), (0, 0, 3)], atol=1e-9)
+    (tmp_path / "short.csv").write_text("file,x,y,z\na.png,1,2,3\n")
+    short = read_poses(tmp_path / "short.csv")["a.png"]
+    np.testing.assert_allclose(short.points_m(ahead_right_up, 2.0), found["a.png"])
+
+
+def test_a_folder_of_poses_has_the_axes_of_opengl(tmp_path: Path) -> None:
+    rotation, location = random_rotation(np.random.default_rng(1)), np.array([0.3, -0.2, 0.7])
+    for prefix in ("00_", "hall/"):
+        (tmp_path / "hall").mkdir(exist_ok=True)
+        np.savetxt(tmp_path / f"{prefix}rot.txt", rotation)
+        np.savetxt(tmp_path / f"{prefix}tran.txt", location)
+    poses = read_poses(tmp_path)
+    assert poses.keys() == {"00_rgb.png", "hall/rgb.png"}
+    ahead_right_up = np.array([(0, 0, -1), (1, 0, 0), (0, 1, 0)])  # x right, y up, z back
+    x, y, z = (2 * ahead_right_up @ rotation.T + location).T
+    expected = np.stack([-z, -x, y], axis=1)
+    for pose in poses.values():
+        np.testing.assert_allclose(pose.points_m(np.eye(3), 2.0), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("poses.csv", "name,x,y,z\na,1,2,3\n"),
+        ("poses.csv", "file,x,y,z\na,1,2\n"),
+        ("poses.csv", "file,x,y,z\na,1,2,west\n"),
+        ("poses.csv", "file,x,y,z,qw,qx,qy,qz\na,1,2,3,0,0,0,0\n"),
+        ("poses.json", "file,x,y,z\na,1,2,3\n"),
+        ("poses/tran.txt", "1 2 3"),
+    ],
+)
+def test_other_poses_are_refused(file: str, content: str, tmp_path: Path) -> None:
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text(content)
+    with pytest.raises(DataError, match=r"poses.*expected .*\.csv"):
+        read_poses(tmp_path / PurePath(file).parts[0])

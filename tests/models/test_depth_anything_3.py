@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from models import DepthAnything3
-from tangent_train.errors import SettingError
 from tests.inference.test_many_views import (
     Ball,
     many_view_network,
@@ -57,11 +56,3 @@ def test_cameras_are_those_of_the_package(monkeypatch: pytest.MonkeyPatch) -> No
     ratio = mosaic.pixels().numpy() / true_distances()
     np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=1e-4)
     assert float(mosaic.facts["rotation_error_deg"]) < 1e-2
-
-
-def test_a_missing_package_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "depth_anything_3", None)
-    with pytest.raises(SettingError, match="pip install --no-deps depth-anything-3 addict einops"):
-        DepthAnything3()
-    with pytest.raises(SettingError, match="preset: found 'da3metric-large'; expected 'da3-small'"):
-        DepthAnything3("da3metric-large")

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from models import HexUNet, IcoCNN, UNet, ZonalClassifier
+from models import HexUNet, UNet, ZonalClassifier
 from models.unet import Down, check_size
 from tangent_train.checkpoints.loaded import declared_sizes
 from tangent_train.errors import SettingError
@@ -58,9 +58,7 @@ def test_scores_have_the_size_of_the_images_and_every_parameter_learns(network: 
     ("network", "size", "message"),
     [
         (UNet(3, 4), (48, 64), r"64 × 48 \(.*\); expected sides that are multiples of 32"),
-        (HexUNet(3, 4), (24, 32), "HexUNet: found 32 × 24 .* multiples of 16"),
         (UNet(3, 4), (1, 2562), "2562 × 1 .*network=ugscnn"),
-        (IcoCNN(3, 4, 1, (4, 4)), (32, 64), "found 64 × 32 .* 42 × 1 .*=icosphere"),
         (ZonalClassifier(2, 4, 3), (32, 64), "found 64 × 32 .* 32 × 16 .*representation=erp"),
     ],
 )

@@ -13,58 +13,11 @@ from torch import Tensor
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import SettingError
 from tests.photo_networks import huggingface_networks as networks
+from tests.photo_networks.prompted_networks import saved_clipseg, saved_sam3
+from tests.running import composed_settings
 
-SIZES: dict[str, Any] = {
-    "hidden_size": 16,
-    "intermediate_size": 16,
-    "num_attention_heads": 2,
-    "num_hidden_layers": 2,
-}
 PROMPTS = {"seat": ["mast", "eskis"], "tah": ["tah"]}
 TEXTS = ["mast", "eskis", "tah"]
-
-
-def _text(**more: Any) -> dict[str, Any]:
-    # Positions of the end token of `networks.tokenizer`.
-    return SIZES | {"vocab_size": 64, "max_position_embeddings": 16, "eos_token_id": 27} | more
-
-
-def clipseg() -> networks.Made:
-    hf = networks.transformers
-    vision = SIZES | {"num_hidden_layers": 3, "image_size": 64, "patch_size": 16}
-    config = hf.CLIPSegConfig(
-        text_config=_text(),
-        vision_config=vision,
-        projection_dim=8,
-        extract_layers=[0, 1, 2],
-        reduce_dim=8,
-        decoder_num_attention_heads=2,
-        decoder_intermediate_size=8,
-    )
-    size = {"height": 64, "width": 64}
-    return hf.CLIPSegForImageSegmentation(config), hf.ViTImageProcessor(size=size)
-
-
-def sam3() -> networks.Made:
-    hf = networks.transformers
-    layers = {"hidden_size": 16, "num_attention_heads": 2}
-    backbone = SIZES | {"model_type": "sam3_vit_model", "image_size": 56, "patch_size": 14}
-    backbone |= {"window_size": 2, "global_attn_indexes": [1], "pretrain_image_size": 56}
-    detr = layers | {"num_layers": 1, "intermediate_size": 16}
-    config = hf.Sam3Config(
-        vision_config={
-            "backbone_config": backbone,
-            "fpn_hidden_size": 16,
-            "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]],
-        },
-        text_config=_text(model_type="clip_text_model", projection_dim=8),
-        geometry_encoder_config=detr,
-        detr_encoder_config=detr,
-        detr_decoder_config=detr | {"num_queries": 5},
-        mask_decoder_config=layers,
-    )
-    size = {"height": 56, "width": 56}
-    return hf.Sam3Model(config), hf.Sam3ImageProcessor(size=size)
 
 
 def _tokens(folder: Path, length: int = 16) -> Any:
@@ -81,8 +34,7 @@ def _images(trained: Any, side: int) -> Tensor:
 
 @torch.no_grad()
 def test_scores_of_clipseg_are_those_of_the_library(tmp_path: Path) -> None:
-    network, _ = networks.saved(clipseg, tmp_path)
-    networks.tokenizer(tmp_path)
+    network = saved_clipseg(tmp_path)
     trained = networks.imported(tmp_path, prompts=PROMPTS, threshold=0.6)
     assert trained.class_names == ("unknown", "seat", "tah")
     assert (trained.things, trained.fixed_size) == ((), (64, 64))
@@ -97,22 +49,14 @@ def test_scores_of_clipseg_are_those_of_the_library(tmp_path: Path) -> None:
     networks.assert_same(scores[:, 0], expected[:, :2].amax(1))
     networks.assert_same(scores[:, 1], expected[:, 2])
     networks.assert_same(scores[:, 2].sigmoid(), torch.full_like(scores[:, 2], 0.6))
+    assert not torch.allclose(expected[:, 0], expected[:, 1], atol=1e-3)  # the text is read
     again = load_network(tmp_path / "imported.ckpt")
     networks.assert_same(again.network(images), scores)
-    names = again.module.state_dict()
-    assert not any("text" in name for name in names)
 
 
 @torch.no_grad()
 def test_scores_and_objects_of_sam_are_those_of_the_library(tmp_path: Path) -> None:
-    network, processor = networks.saved(sam3, tmp_path, noise=0.4)
-    networks.tokenizer(tmp_path)
-    last = network.detr_decoder.presence_head.layer3
-    last.weight.zero_()
-    last.bias.fill_(2)  # objects are there
-    for parameter in network.dot_product_scoring.text_proj.parameters():
-        parameter.mul_(-0.3)
-    network.save_pretrained(tmp_path)
+    network, processor = saved_sam3(tmp_path)
     trained = networks.imported(tmp_path, prompts=PROMPTS)
     assert trained.things == ("seat", "tah")
     images = _images(trained, 56)
@@ -150,14 +94,41 @@ def test_scores_and_objects_of_sam_are_those_of_the_library(tmp_path: Path) -> N
         assert torch.equal(of_image.numbers, front.int())
 
 
-def test_prompts_of_a_file(tmp_path: Path) -> None:
-    networks.saved(clipseg, tmp_path)
-    networks.tokenizer(tmp_path)
+def test_other_prompts_and_threshold(tmp_path: Path) -> None:
+    saved_clipseg(tmp_path)
+    expected = networks.imported(tmp_path, prompts=PROMPTS, threshold=0.6)
+    trained = networks.imported(tmp_path, prompts={"kite": ["kite"]})
+    changed = trained.prompted(PROMPTS, 0.6)
+    assert changed.class_names == expected.class_names
+    assert (changed.groups, changed.settings) == (expected.groups, expected.settings)
+    images = _images(trained, 64)
+    scores = changed.network(images)
+    assert torch.equal(scores, expected.network(images))
+    networks.assert_same(trained.prompted("tah").network(images)[:, 0], scores[:, 1])
+    with pytest.raises(ValueError, match="a text for each class"):
+        trained.prompted({"seat": []})
+
+
+def test_texts_of_classes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "prompts.txt").write_text("mast\n\ntah \n")
-    trained = networks.imported(tmp_path, prompts=[str(tmp_path / "prompts.txt")])
-    assert trained.class_names == ("unknown", "mast", "tah")
-    with pytest.raises(SettingError, match="prompts: found none; expected a text for each class"):
-        networks.imported(tmp_path, prompts=[])
-    networks.saved(networks.segformer, tmp_path / "other")
-    with pytest.raises(SettingError, match="model_type: found 'segformer'; expected 'clipseg'"):
-        networks.imported(tmp_path / "other", prompts=["mast"])
+    (tmp_path / "mast").write_text("a file, not its texts")
+    common = "library=huggingface", "model=net", "output=net.ckpt"
+    for given, expected in {
+        "prompts.txt": {"mast": ["mast"], "tah": ["tah"]},
+        "mast": {"mast": ["mast"]},
+        "[mast,picture frame]": {"mast": ["mast"], "picture frame": ["picture frame"]},
+        "{seat: [mast, eskis], tah: tah}": PROMPTS,
+    }.items():
+        assert composed_settings("import", *common, f"prompts={given}").prompts == expected
+    with pytest.raises(SettingError, match=r"prompts: .* expected a text"):
+        composed_settings("import", *common, "prompts=[]")
+
+
+def test_networks_without_text_are_refused(tmp_path: Path) -> None:
+    networks.saved(networks.segformer, tmp_path)
+    with pytest.raises(SettingError, match="a network without text"):
+        networks.imported(tmp_path).prompted(["mast"])
+    networks.tokenizer(tmp_path)
+    with pytest.raises(SettingError, match="found 'segformer'; expected 'clipseg' or 'sam3'"):
+        networks.imported(tmp_path, prompts=PROMPTS)

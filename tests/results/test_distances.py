@@ -79,7 +79,7 @@ def test_a_photo_shows_z_depth_and_its_points_lie_on_a_wall(tmp_path: Path) -> N
     directions = perspective_directions(matrix, small)
     z_depth = 2 / (directions @ normal) * directions[..., 2]
     shown = {"camera_matrix": camera_matrix_from_fov(70.0, size), "sphere": False}
-    image = on_page(tmp_path, "photo", rgb_of(size), prediction=z_depth, is_metric=False, **shown)
+    image = on_page(tmp_path, "photo", rgb_of(size), prediction=z_depth, unit="relative", **shown)
     np.testing.assert_allclose(unpacked(image, "prediction"), z_depth, rtol=2e-5)
     fx, fy, cx, cy = image["scale"]["camera"]
     u, v = np.meshgrid((np.arange(40) + 0.5) / 40, (np.arange(30) + 0.5) / 30)
@@ -87,7 +87,7 @@ def test_a_photo_shows_z_depth_and_its_points_lie_on_a_wall(tmp_path: Path) -> N
     np.testing.assert_allclose(z_depth[..., None] * rays @ normal, 2, rtol=2e-5)
     middle = np.array(image["scale"]["center"]) @ TO_AHEAD_RIGHT_UP
     assert middle @ normal == pytest.approx(2, rel=0.1)
-    assert not image["scale"]["is_metric"]
+    assert image["scale"]["unit"] == "relative"
 
 
 @pytest.mark.parametrize("value", [np.nan, 3.0])

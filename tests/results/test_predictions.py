@@ -24,8 +24,6 @@ NAMES = ("unknown", "up", "down")
 @pytest.mark.parametrize(
     ("paths", "names"),
     [
-        (["photos/a.jpg"], ["a"]),
-        (["p/x/a.jpg", "p/y/a.jpg"], ["x/a", "y/a"]),
         (["p/a.jpg", "p/a.png", "p/A.tif", "p/b.c.jpg"], ["a.jpg", "a.png", "A.tif", "b.c"]),
         (["p/q/a.jpg", "b.jpg"], ["p/q/a", "b"]),
         (["1.jpg", "1.png", "1.jpg.png"], ["1.jpg", "1.png", "1.jpg.png"]),

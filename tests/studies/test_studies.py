@@ -24,6 +24,7 @@ from studies.representation_distortion import representation_distortion
 from studies.rotation_error import icosahedral_rotations, mean_error
 from studies.strips import write_strips
 from studies.surface_area import surface_area
+from studies.trained_objects import Centers, connected_parts
 from studies.transfer import STAGES
 from studies.transfer import picture as picture_of_transfer
 from studies.transfer import table as table_of_transfer
@@ -225,3 +226,25 @@ def test_the_measures_of_known_predictions_are_on_their_page() -> None:
     assert (west["seam_step"], west["seam_gap"]) == pytest.approx((100 - 100 / 2047, -25))
     ramp = rows["distances that grow from 1 m to 2 m"]
     assert ramp["seam_step"] == pytest.approx(100 * math.log(2) * (1 - 2 / 2048))
+
+
+def test_centers_separate_objects_that_touch() -> None:
+    """Two chairs (label 5) and a sofa (10) side by side, with perfect maps."""
+    codes = torch.full((64, 64), 12 * 65536)
+    areas = {5 * 65536 + 7: (0, 20), 5 * 65536 + 8: (20, 40), 10 * 65536 + 9: (40, 64)}
+    heat, offsets = torch.zeros(64, 64), torch.zeros(2, 64, 64)
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    for code, (left, right) in areas.items():
+        codes[10:50, left:right] = code
+        center = 30, (left + right) // 2
+        heat[center] = 1
+        offsets[0, 10:50, left:right] = (center[0] - rows)[10:50, left:right].float()
+        offsets[1, 10:50, left:right] = (center[1] - columns)[10:50, left:right].float()
+    shares = torch.nn.functional.one_hot(codes // 65536 - 1, 13).permute(2, 0, 1).float()
+    network = Centers()
+    found = network.segments(shares, heat, offsets)
+    assert sorted(found.classes.tolist()) == [4, 4, 9]
+    parts = [connected_parts(network, shares).numbers, found.numbers]
+    for code in areas:
+        whole = codes == code
+        assert [torch.equal(n == n[whole][0], whole) for n in parts] == [code > 6 * 65536, True]

@@ -56,6 +56,14 @@ class Looking(_Plain):
         return super().forward(images) * (2 if bool(images.sum() > 0) else 1)
 
 
+class Sure(_Plain):
+    """Depth with a confidence."""
+
+    def forward(self, images: Tensor) -> Any:
+        depth, confidence, *_ = super().forward(images).exp().unbind(dim=1)
+        return {"out": depth, "confidence": confidence}
+
+
 def config_section(name: str) -> dict[str, Any]:
     """Settings of a network of this module."""
     return {"_target_": f"{__name__}.{name}"}

@@ -39,13 +39,6 @@ class EquirectViews(Views):
     width: int
     mirrored: bool = False
 
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, part: slice) -> Self:
-        """Return the view itself."""
-        return self
-
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """See `Views`."""
         shown: Any = image

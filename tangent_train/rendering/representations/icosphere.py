@@ -72,13 +72,6 @@ class IcosphereViews(Views):
     interpolation: ScoreInterpolation = "barycentric"
     is_overlapping = False
 
-    def __len__(self) -> int:
-        return 1
-
-    def __getitem__(self, part: slice) -> Self:
-        """Return the view itself."""
-        return self
-
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """Render the signal, with the dtype of the image.
 

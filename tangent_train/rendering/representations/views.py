@@ -47,7 +47,7 @@ class Views:
     """
 
     is_overlapping: bool
-    chosen: NDArray[np.int64]
+    chosen: NDArray[np.int64] = np.zeros(1, np.int64)
     num_images: int = 1
     key: Hashable
     is_rotated: bool = False
@@ -61,8 +61,8 @@ class Views:
         return len(self.chosen)
 
     def __getitem__(self, part: slice) -> Self:
-        """Return some of the views."""
-        raise NotImplementedError
+        """Return some of the views; a single one is returned itself."""
+        return self
 
     def reduced(self, image: Pixels) -> Pixels:
         """Return an image at the resolution of the views, for many calls of `render`."""

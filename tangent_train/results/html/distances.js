@@ -4,7 +4,6 @@ class Distances {
   constructor(scale, sphere, colors) {
     Object.assign(this, scale, { sphere, colors });
     this.noun = sphere || !scale.camera ? "distance" : "z-depth";
-    this.unit = scale.is_metric ? "m" : "relative";
     this.logs = [scale.near, scale.far, ...scale.limits].map(Math.log);
   }
 
@@ -30,7 +29,7 @@ class Distances {
   }
 
   text(distance) {
-    return `${this.number(distance)} ${this.is_metric ? "m" : "(relative)"}`;
+    return `${this.number(distance)} ${this.unit === "m" ? "m" : `(${this.unit})`}`;
   }
 }
 

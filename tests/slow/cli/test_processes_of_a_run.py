@@ -14,10 +14,10 @@ import torch
 
 from tangent_train.cli.processes import command_line
 from tangent_train.results.evaluation import load_result
-from tests.cli.test_train import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.datamodules.data_files import write_png
 from tests.running import run_python
+from tests.slow.cli.test_signals import CUT_SHORT
 
 TRAIN, EVALUATE = (command_line(name, (), Path())[0] for name in ("train", "evaluate"))
 

@@ -25,11 +25,10 @@ def _last(folder: Path) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("trainer", "settings", "at", "step", "value"),
     [
-        ({}, {}, 2, 2, torch.nan),
         ({}, {"view_batch_size": 7}, 2 * 3 + 1, 2, torch.inf),  # not the last part of its step
         ({"accumulate_grad_batches": 2}, {}, 3, 1, torch.nan),  # the second batch of the step
     ],
-    ids=["plain", "in chunks", "accumulated"],
+    ids=["in chunks", "accumulated"],
 )
 def test_a_loss_that_is_not_finite_stops_before_the_step(
     stanford_root: Path,

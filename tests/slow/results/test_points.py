@@ -41,7 +41,7 @@ def photo() -> EncodedImage:
     """Camera axes are right, down, ahead; the room's are ahead, right, up."""
     matrix = camera_matrix_from_fov(FOV_DEG, PHOTO)
     rays = perspective_directions(matrix, PHOTO) @ [[0, 1, 0], [0, 0, -1], [1, 0, 0]]
-    return room(rays, camera_matrix=matrix, is_metric=False)
+    return room(rays, camera_matrix=matrix, unit="relative")
 
 
 def truth_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
