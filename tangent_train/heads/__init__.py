@@ -34,7 +34,8 @@ def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:
     Raises:
         SettingError: A setting is not one of that head, or invalid; or there are too many classes.
     """
-    if (count := len(loaded.class_names) - 1) > 255:  # labels in files have 8 bits
+    count = len(loaded.class_names) - 1
+    if loaded.things and count > 255:  # panoptic maps have 8 bits for the label
         remedy = "Map them to fewer with label_map=."
         raise SettingError("classes", found=count, expected="at most 255", remedy=remedy)
     try:
