@@ -13,7 +13,7 @@ import tangent_train
 from tangent_train.cli import main, processes
 from tests.cli.tiny_runs import run_command
 from tests.config.test_settings import GIVEN
-from tests.running import Capture, Patch, composed_settings
+from tests.running import Capture, Patch, composed_settings, run_python
 
 UNREAD = "expected no such setting: tangent-evaluate does not read it."
 
@@ -156,6 +156,13 @@ def test_the_package_lists_its_commands(monkeypatch: Patch, capsys: Capture) -> 
     assert commands == {
         line.split()[0] for line in scripts.read_text().splitlines() if "cli.main:" in line
     }
+
+
+def test_modules_run_as_commands(tmp_path: Path) -> None:
+    done = run_python(tmp_path, "-m", "tangent_train.cli.export", "output=x.onnx")
+    assert done.returncode == 1
+    example = "tangent-export checkpoint=<run>/checkpoints/best.ckpt output=model.onnx"
+    assert done.stderr == f"tangent-export: Missing: checkpoint=. Example: {example}\n"
 
 
 @pytest.mark.parametrize(

@@ -97,6 +97,17 @@ def test_optuna_compares_runs_of_submitit_by_their_validation(
     assert rate in rates
 
 
+@OLD_SQLALCHEMY
+def test_a_search_goes_on_after_runs_that_diverge(
+    settings: tuple[str, ...], tmp_path: Path, run: Run
+) -> None:
+    study = ("hydra.sweeper.n_trials=2", "hydra.sweep.dir=study", "optimizer.lr=choice(1e30,1e31)")
+    with pytest.raises(SystemExit, match="No trials are completed"):
+        run("train", "-m", "sweep=optuna", *study, *settings)
+    for number in "01":
+        assert "SettingError: loss of" in (tmp_path / "study" / number / "train.log").read_text()
+
+
 def test_failing_jobs_are_shown_and_do_not_stop_the_others(
     tmp_path: Path, run: Run, capfd: pytest.CaptureFixture[str]
 ) -> None:
