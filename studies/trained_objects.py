@@ -91,7 +91,7 @@ class Centers(nn.Module):
 
         Args:
             images: Views ``(n, 3, h, w)``.
-            codes: Their panoptic maps ``(n, h, w)``.
+            codes: Panoptic maps of the views ``(n, h, w)``.
         """
         scores, heat, offsets = self._maps(images)
         codes = codes[:, ::2, ::2]

@@ -38,9 +38,8 @@ def check_paths(settings: Settings) -> None:
         raise SettingError("data.root", found=f"{root}, no such folder", expected=expected)
     if isinstance(settings, PredictSettings | RenderSettings) and values["input"] is not None:
         input_paths(values["input"])
-    for path in filter(None, (output,)):
-        if "overwrite" in values and Path(path).is_file():
-            check_new(path, overwrite=values["overwrite"])
+    if "overwrite" in values and output and output.is_file():
+        check_new(output, overwrite=values["overwrite"])
     if isinstance(settings, PredictSettings | RenderSettings) and output and not output.is_file():
         content = settings.model_dump(mode="json", exclude={*settings.not_content})
         check_continues(output, content, _STORED_OTHERWISE)

@@ -144,8 +144,7 @@ def _world(settings: RenderSettings, names: Sequence[str]) -> tuple[dict[str, Pa
     A single panorama, called "", defines the world.
     """
     if (path := settings.poses) is not None:
-        poses = {file: pose for file, (pose, _) in poses_from(path, settings.cameras).items()}
-        return poses, model_points(path) if is_model(path) else None
+        return _poses(settings, path), model_points(path) if is_model(path) else None
     if len(names) > 1:
         expected = f"poses of the {len(names)} panoramas: a COLMAP model, or a JSON file"
         raise SettingError("poses", found="null", expected=expected)
@@ -167,6 +166,11 @@ def _render_missing(
             file = job.name if job.is_frame else job.name.removesuffix(suffix) + suffix
             manifest.finish(job.name, file=file)
     return len(manifest.missing(names))
+
+
+def _poses(settings: RenderSettings, path: Path) -> dict[str, PanoramaPose]:
+    """Return the poses of panoramas by file."""
+    return {file: pose for file, (pose, _) in poses_from(path, settings.cameras).items()}
 
 
 def _print_written(output: Path, names: Sequence[str], failed: int) -> None:
@@ -246,7 +250,7 @@ def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
     model, output = settings.poses or Path(), settings.output
     check_new(output, overwrite=settings.overwrite)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
-    poses = {file: pose for file, (pose, _) in poses_from(model, settings.cameras).items()}
+    poses = _poses(settings, model)
     write_poses(output, poses)
     count = counted(len(rig.panoramas), "panoramas")
     print_text(f"Written: {output}, poses of {len(poses)} of {count}")

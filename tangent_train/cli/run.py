@@ -313,7 +313,7 @@ def build_callbacks(settings: RunSettings, task: Any) -> list[Any]:
         monitor = section.get("monitor") or task.monitor
         known = {"monitor": monitor, "mode": task.head.mode_of(monitor)}
         built.append(build_from_config(filled(section, known), f"callbacks.{name}"))
-        if remedy := _REFUSED.get(type(built[-1])):
+        if remedy := next((text for of, text in _REFUSED.items() if isinstance(built[-1], of)), ""):
             found, expected = type(built[-1]).__name__, "a callback that can be resumed and tested"
             raise SettingError(f"callbacks.{name}", found=found, expected=expected, remedy=remedy)
     return built

@@ -56,8 +56,8 @@ class EncodedImage(NamedTuple):
         shares: ``(label, share of the truth, share of the prediction)`` of the labels that occur,
             the largest first, without shares of missing maps; by solid angle for panoramas.
         scale: Scale of the distances, see `pack_distances`; None for labels.
-        objects: Row of each object in the table by its number, which is the green channel of the
-            PNG of predicted labels; None for a gray PNG.
+        objects: Row of each object in the table by its number, which the PNG of predicted labels
+            holds in its green and blue channels (green + 256 blue); None for a gray PNG.
     """
 
     name: str
